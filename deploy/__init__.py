@@ -1,0 +1,1 @@
+"""Data only: stacks, sensor heads, and what a host needs to run them."""

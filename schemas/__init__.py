@@ -1,0 +1,1 @@
+"""What travels: messages, the topics table, and their bytes."""

@@ -1,0 +1,1 @@
+"""Cameras and projectors, opened by URI; simulated ones beside real ones."""

@@ -1,0 +1,1 @@
+"""The loop every service runs in: bus, shared memory, launcher, replay. It never computes."""

@@ -1,0 +1,94 @@
+"""What a service is: typed inputs, a pure step, outputs.
+
+A step has no clock, no transport and no thread: time arrives in the messages. The same class runs live,
+in replay and in tests, so a replay is bit-exact.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any, ClassVar, Generic, Protocol, TypeVar
+
+import numpy as np
+from endo3d.schemas.messages import Message
+from endo3d.schemas.topics import Topic
+from numpy.typing import DTypeLike, NDArray
+from pydantic import BaseModel, ConfigDict
+
+
+class Config(BaseModel):
+    """A service's table in the stack file. Unknown keys are errors."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+C = TypeVar("C", bound=Config)
+
+
+class Loan(Protocol):
+    """Lends an array that the runtime owns, so that publishing it copies nothing."""
+
+    def __call__(self, topic: Topic, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
+        """An uninitialised array; raises ``Exhausted`` when every slot is still being read."""
+
+
+class Exhausted(Exception):
+    """No free shared memory: the message is dropped and counted."""
+
+
+class Refused(Exception):
+    """A command that can't be carried out; its text says why and what to do."""
+
+
+def plain_loan(topic: Topic, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
+    """Ordinary memory: replay and tests."""
+    return np.empty(shape, dtype)
+
+
+class Service(Generic[C]):
+    """Inputs, step, outputs. Wiring is derived from ``reads`` and ``writes``."""
+
+    Config: ClassVar[type[Config]] = Config
+    reads: ClassVar[tuple[Topic, ...]] = ()
+    writes: ClassVar[tuple[Topic, ...]] = ()
+    commands: ClassVar[tuple[str, ...]] = ()
+    """The verbs ``command`` understands."""
+
+    def __init__(self, config: C) -> None:
+        self.config = config
+        self.loan: Loan = plain_loan
+
+    def open(self) -> None:
+        """Take what has to be taken (a device, a file). Raises with what to do."""
+
+    def warm(self) -> None:
+        """Compile and touch everything a first step would otherwise wait for."""
+
+    def step(self, message: Message) -> Iterator[Message]:
+        """One message in, any number out."""
+        return iter(())
+
+    def command(self, verb: str, parameters: Mapping[str, Any], now_ns: int) -> Iterator[Message | Mapping[str, Any]]:
+        """A command from the control plane: yields messages to publish and at most one mapping, the reply.
+
+        Raises ``Refused`` with what to do.
+        """
+        raise Refused(f"no command {verb!r}; this service knows: {', '.join(self.commands) or 'none'}")
+
+    def values(self) -> Mapping[str, float]:
+        """The service's own figures for its status."""
+        return {}
+
+    def close(self) -> None:
+        """Give everything back; called once, also after a failure."""
+
+
+class Source(Service[C]):
+    """A service that produces by itself: a camera, a player. ``poll`` replaces an input."""
+
+    def poll(self, timeout_s: float) -> Iterator[Message]:
+        """Wait at most ``timeout_s`` for the outside world and yield what came."""
+        return iter(())
+
+    finished: bool = False
+    """Nothing more will come."""
