@@ -50,6 +50,8 @@ class Service(Generic[C]):
 
     Config: ClassVar[type[Config]] = Config
     reads: ClassVar[tuple[Topic, ...]] = ()
+    optional: ClassVar[tuple[Topic, ...]] = ()
+    """Those of ``reads`` that need no writer in the stack."""
     writes: ClassVar[tuple[Topic, ...]] = ()
     commands: ClassVar[tuple[str, ...]] = ()
     """The verbs ``command`` understands."""
