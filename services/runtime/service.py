@@ -6,14 +6,16 @@ in replay and in tests, so a replay is bit-exact.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from typing import Any, ClassVar, Generic, Protocol, TypeVar
 
 import numpy as np
-from endo3d.schemas.messages import Message
-from endo3d.schemas.topics import Topic
 from numpy.typing import DTypeLike, NDArray
 from pydantic import BaseModel, ConfigDict
+
+from endo3d.schemas.messages import Message
+from endo3d.schemas.topics import Topic
 
 
 class Config(BaseModel):
@@ -38,6 +40,25 @@ class Exhausted(Exception):
 
 class Refused(Exception):
     """A command that can't be carried out; its text says why and what to do."""
+
+
+def _always() -> bool:
+    return True
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """What travelled, still encoded: what a ``Tap`` takes."""
+
+    topic: Topic
+    source: str
+    """The service that wrote it, for topics written per service; else empty."""
+    payload: memoryview
+    """The encoded message, bytes; valid during the call only."""
+    received_ns: int
+    """When it arrived here."""
+    valid: Callable[[], bool] = _always
+    """To ask AFTER copying: False when the writer's memory was reclaimed meanwhile (drop it, count it)."""
 
 
 def plain_loan(topic: Topic, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
@@ -70,7 +91,9 @@ class Service(Generic[C]):
         """One message in, any number out."""
         return iter(())
 
-    def command(self, verb: str, parameters: Mapping[str, Any], now_ns: int) -> Iterator[Message | Mapping[str, Any]]:
+    def command(
+        self, verb: str, parameters: Mapping[str, Any], now_ns: int
+    ) -> Iterator[Message | Mapping[str, Any]]:
         """A command from the control plane: yields messages to publish and at most one mapping, the reply.
 
         Raises ``Refused`` with what to do.
@@ -94,3 +117,11 @@ class Source(Service[C]):
 
     finished: bool = False
     """Nothing more will come."""
+
+
+class Tap(Service[C]):
+    """A service that takes what travels undecoded: the recorder, a relay. ``take`` is called instead of ``step``."""
+
+    def take(self, sample: Sample) -> Iterator[Message]:
+        """One sample in; what has to outlive the call is copied, then ``sample.valid()`` is asked."""
+        return iter(())
