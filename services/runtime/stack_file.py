@@ -49,6 +49,8 @@ class RigTable(BaseModel):
     """The second part of every key: ``endo3d/<name>/...``."""
     head: str = "base6_wd20"
     """A stock head's name, or a file with the calibration, relative to the stack file."""
+    port: int | None = Field(None, ge=1024, le=65535)
+    """Where the services of this host meet, on the loopback; None derives it from the name."""
 
 
 @dataclass(frozen=True)
@@ -99,13 +101,15 @@ class Stack:
 
     def entry(self, name: str) -> Entry:
         """One service, imported and validated."""
+        kind = self.kind(name)
+        given = {key: value for key, value in self.tables[name].items() if key not in RESERVED}
+        return Entry(name, kind.__module__.rpartition(".")[2], kind, self._config(name, kind.Config, given))
+
+    def kind(self, name: str) -> type[Service[Any]]:
+        """The class behind a table, imported; its keys are not looked at."""
         if name not in self.tables:
             raise UserError(f"{self.label} has no service {name!r}; {_nearest(name, self.tables)}")
-        table = self.tables[name]
-        module = table.get("module", name)
-        kind = _service_class(module, self._where(name, "module"))
-        given = {key: value for key, value in table.items() if key not in RESERVED}
-        return Entry(name, module, kind, self._config(name, kind.Config, given))
+        return _service_class(self.tables[name].get("module", name), self._where(name, "module"))
 
     def _config(self, name: str, model: type[Config], given: dict[str, Any]) -> Config:
         shared = {"rig": self.rig.name, "stack": str(self.path or ""), "stack_toml": self.toml}

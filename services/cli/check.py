@@ -1,0 +1,83 @@
+"""``endo3d check``: a stack file, validated and drawn."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from endo3d.services.cli.options import JsonOption, SetOption, StackArgument
+
+if TYPE_CHECKING:
+    from rich.tree import Tree
+
+    from endo3d.services.runtime.graph import Graph
+    from endo3d.services.runtime.stack_file import Stack
+
+
+def check(
+    stack: StackArgument = "demo",
+    overrides: SetOption = None,
+    as_json: JsonOption = False,
+    mermaid: Annotated[bool, typer.Option("--mermaid", help="The graph for a README.")] = False,
+    dot: Annotated[bool, typer.Option("--dot", help="The graph for Graphviz.")] = False,
+    keys: Annotated[str, typer.Option("--keys", metavar="SERVICE", help="List the keys of a service's table.")] = "",
+) -> None:
+    """Check a stack file and print its dataflow.
+
+    Refuses an unknown key, a read that nobody writes, and two writers of one topic.
+
+    Examples: endo3d check demo; endo3d check my.toml --keys decoder
+    """
+    from rich import print as show
+
+    from endo3d.services.runtime import graph, stack_file
+
+    described = stack_file.load(stack, overrides or ())
+    if keys:
+        _show_keys(described, keys)
+        return
+    wiring = graph.of(described)
+    if as_json:
+        print(json.dumps(wiring.as_dict(), indent=2))
+    elif mermaid:
+        print(wiring.mermaid())
+    elif dot:
+        print(wiring.dot())
+    else:
+        show(_tree(described, wiring))
+
+
+def _tree(stack: Stack, wiring: Graph) -> Tree:
+    from rich.tree import Tree
+
+    tree = Tree(f"[bold]endo3d/{wiring.rig}[/]  [dim]{stack.label}, head {stack.rig.head}[/]")
+    for entry in wiring.entries:
+        other = f" [dim](module {entry.module})[/]" if entry.module != entry.name else ""
+        branch = tree.add(f"[bold cyan]{entry.name}[/]{other}")
+        for topic in entry.kind.writes:
+            how = f"{topic.message.__name__}, up to {topic.rate_hz:g} Hz"
+            how += ", shared memory" if topic.bulk else ""
+            readers = wiring.readers(entry.name, topic)
+            branch.add(f"[green]{topic.name}[/] [dim]({how})[/] → {', '.join(readers) or '[dim]nobody[/]'}")
+        if not entry.kind.writes:
+            read = sorted({edge.topic.name for edge in wiring.edges if edge.reader == entry.name})
+            branch.add(f"[dim]reads {', '.join(read)}[/]")
+    return tree
+
+
+def _show_keys(stack: Stack, service: str) -> None:
+    from rich import box
+    from rich import print as show
+    from rich.table import Table
+
+    table = Table(title=f"[{service}]", box=box.SIMPLE, title_justify="left")
+    for column in ("key", "type", "default", "here"):
+        table.add_column(column)
+    given = stack.tables.get(service, {})
+    for name, field in stack.kind(service).Config.model_fields.items():
+        default = "required" if field.is_required() else repr(field.get_default(call_default_factory=True))
+        annotation = getattr(field.annotation, "__name__", str(field.annotation))
+        table.add_row(name, annotation, default, repr(given[name]) if name in given else "")
+    show(table)

@@ -1,0 +1,32 @@
+"""``endo3d run``: one service of a stack, in this process."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from endo3d.services.cli.options import SetOption, StackOption
+
+
+def run(
+    service: Annotated[str, typer.Argument(help="The service's table in the stack file.")],
+    stack: StackOption = "demo",
+    overrides: SetOption = None,
+) -> None:
+    """Run one service of a stack in this process.
+
+    The launcher does this for every service; by hand it serves for debugging, or to spread a stack over
+    terminals. Services may be started in any order.
+
+    Example: endo3d run decoder --stack demo --set decoder.mode=three-frame
+    """
+    from endo3d.services.runtime.launcher import follow_parent
+
+    follow_parent()
+
+    from endo3d.services.runtime import runner, stack_file
+
+    described = stack_file.load(stack, overrides or ())
+    built = described.entry(service).build()
+    raise typer.Exit(runner.run(built, rig=described.rig.name, name=service, port=described.rig.port))

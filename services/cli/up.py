@@ -1,0 +1,78 @@
+"""``endo3d up``: every service of a stack, kept running."""
+
+from __future__ import annotations
+
+import signal
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from endo3d.services.cli.options import SetOption, StackArgument
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+COLOURS = ("cyan", "green", "magenta", "yellow", "blue", "bright_red", "bright_cyan", "bright_green")
+
+
+def up(
+    stack: StackArgument,
+    overrides: SetOption = None,
+    seconds: Annotated[float, typer.Option("--seconds", help="Stop after that long; 0 runs on.")] = 0.0,
+) -> None:
+    """Start every service of a stack file, and keep them running.
+
+    A crashed service is restarted, first after 0.2 s. Ctrl-C stops all, sources first, so that the archive is
+    closed; a second Ctrl-C kills what has not stopped yet.
+
+    Examples: endo3d up demo; endo3d up my.toml --set recorder.directory=/data
+    """
+    from endo3d.services.runtime import graph, stack_file
+    from endo3d.services.runtime.errors import UserError
+    from endo3d.services.runtime.launcher import Launcher, children_of
+
+    described = stack_file.load(stack, overrides or ())
+    graph.of(described)
+    asked = Asked()
+    with Launcher(children_of(described, overrides or ()), log_printer(list(described.tables))) as launcher:
+        launcher.start()
+        while not (launcher.done or asked.times or (seconds and asked.after(seconds))):
+            launcher.turn()
+        launcher.stop(hurry=lambda: asked.times > 1)
+    if launcher.user_error:
+        raise UserError(launcher.user_error)
+    raise typer.Exit(launcher.exit_code)
+
+
+class Asked:
+    """Counts how often somebody asked us to stop: Ctrl-C or SIGTERM."""
+
+    def __init__(self) -> None:
+        import time
+
+        self.times = 0
+        self.clock = time.monotonic
+        self.began_s = self.clock()
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, self._count)
+
+    def _count(self, *_: object) -> None:
+        self.times += 1
+
+    def after(self, seconds: float) -> bool:
+        return self.clock() - self.began_s > seconds
+
+
+def log_printer(services: list[str]) -> Callable[[str, str], None]:
+    """Prints (service, line) with the service's name in its own colour; plain where there is no terminal."""
+    from rich.console import Console
+    from rich.text import Text
+
+    console = Console(stderr=True, soft_wrap=True, highlight=False)
+    width = max(map(len, services), default=0)
+    styles = {name: COLOURS[index % len(COLOURS)] for index, name in enumerate(services)}
+
+    def show(service: str, line: str) -> None:
+        console.print(Text.assemble((f"{service:<{width}} │ ", styles.get(service, "bold")), line))
+
+    return show
