@@ -125,7 +125,8 @@ class Launcher:
         """2 if a service refused to start, 1 if one was given up or had to be killed, else 0."""
         if self.user_error:
             return EXIT_USER_ERROR
-        return int(any(child.state is State.GIVEN_UP or child.exit_code not in (0, None) for child in self.children))
+        fine = (0, None, -signal.SIGTERM)
+        return int(any(child.state is State.GIVEN_UP or child.exit_code not in fine for child in self.children))
 
     def stop(self, grace_s: float = STOP_GRACE_S, hurry: Callable[[], bool] = lambda: False) -> None:
         """Stop all, sources first and one after the other, so that what is under way still arrives.
@@ -194,6 +195,8 @@ class Launcher:
         assert process is not None
         assert process.stdout is not None
         code = process.wait()
+        with suppress(ProcessLookupError, PermissionError):
+            os.killpg(process.pid, signal.SIGKILL)  # what it started, and didn't end, goes with it
         if process.stdout in self.selector.get_map():
             self._read(child)
         if process.stdout in self.selector.get_map():
