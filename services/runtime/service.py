@@ -104,6 +104,14 @@ class Service(Generic[C]):
         """The service's own figures for its status."""
         return {}
 
+    def losses(self) -> Mapping[str, int]:
+        """Messages the service itself lost since start, per cause; the runner adds them to the status' drops."""
+        return {}
+
+    def trouble(self) -> str:
+        """One line for people, what is wrong and what to do, while it is: the status is then DEGRADED."""
+        return ""
+
     def close(self) -> None:
         """Give everything back; called once, also after a failure."""
 
