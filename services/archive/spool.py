@@ -1,0 +1,192 @@
+"""Between the pipeline and the disk: a bounded queue, the thread that writes, and counted drops."""
+
+from __future__ import annotations
+
+import logging
+import os
+import threading
+import time
+from collections import Counter, defaultdict
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from queue import Empty, SimpleQueue
+
+from endo3d.services.archive.entry import Entry
+from endo3d.services.archive.layout import Buffer
+from endo3d.services.archive.recording import Recording
+from endo3d.services.archive.writer import OWN_CHUNK_BYTES
+
+FLUSH_S = 0.5
+"""Small messages wait at most this long in memory."""
+QUEUE_MESSAGES = 1 << 16
+"""So many messages are queued at most, however small."""
+SLOT_BYTES = 1 << 16
+"""Slots come in multiples of this."""
+
+_log = logging.getLogger(__name__)
+
+
+class Slots:
+    """Reused memory: page faults of a fresh image-sized allocation cost more than the copy."""
+
+    def __init__(self, budget_bytes: int) -> None:
+        self._budget = budget_bytes
+        self._allocated = 0
+        self._free: defaultdict[int, list[bytearray]] = defaultdict(list)
+        self._lock = threading.Lock()
+
+    def take(self, size: int) -> bytearray | None:
+        """Memory of at least ``size`` bytes; None when the budget is spent."""
+        capacity = -(-size // SLOT_BYTES) * SLOT_BYTES
+        with self._lock:
+            if free := self._free[capacity]:
+                return free.pop()
+            if self._allocated + capacity > self._budget:
+                for other, slots in self._free.items():
+                    self._allocated -= other * len(slots)
+                    slots.clear()
+            if self._allocated + capacity > self._budget:
+                return None
+            self._allocated += capacity
+        return bytearray(capacity)
+
+    def give(self, slot: bytearray) -> None:
+        """Back for the next message."""
+        with self._lock:
+            self._free[len(slot)].append(slot)
+
+
+class Spool:
+    """Takes entries without ever blocking and writes them in a thread of its own.
+
+    ``transform`` runs in that thread (packing). When the disk has less than ``floor_bytes`` left, or a write
+    fails, the recording is closed whole and everything after it counts as dropped; ``trouble`` says why.
+    """
+
+    def __init__(
+        self,
+        recording: Recording,
+        *,
+        queue_bytes: int,
+        floor_bytes: int = 0,
+        reserve_bytes: int = 0,
+        transform: Callable[[Entry], Entry] = lambda entry: entry,
+    ) -> None:
+        self.recording = recording
+        self.dropped: Counter[str] = Counter()
+        """Messages lost, per channel."""
+        self.trouble = ""
+        """One line for people once recording has stopped by itself."""
+        self._slots = Slots(queue_bytes)
+        self._queue: SimpleQueue[tuple[Entry, bytearray | None] | None] = SimpleQueue()
+        self._floor_bytes = floor_bytes
+        self._transform = transform
+        self._reserve = _reserve(recording.path, reserve_bytes)
+        self._thread = threading.Thread(target=self._run, name="archive", daemon=True)
+        self._thread.start()
+
+    @property
+    def queued(self) -> int:
+        """Messages waiting to be written."""
+        return self._queue.qsize()
+
+    def put(self, entry: Entry, valid: Callable[[], bool] = lambda: True) -> bool:
+        """Copy an entry's payload and queue it. False, and counted, when there is no room.
+
+        ``valid`` is asked after the copy: False when the source was overwritten meanwhile.
+        """
+        slot, payload = self._copy(entry)
+        if payload is None or not valid():
+            if slot is not None:
+                self._slots.give(slot)
+            self.dropped[entry.channel] += 1
+            return False
+        self._queue.put((replace(entry, payload=(payload,)), slot))
+        return True
+
+    def close(self) -> None:
+        """Write what is queued and close the file; blocks until that is done."""
+        self._queue.put(None)
+        self._thread.join()
+
+    def _copy(self, entry: Entry) -> tuple[bytearray | None, Buffer | None]:
+        """The slot, if one was taken, and the payload in one piece; None when there is no room."""
+        size = sum(map(len, entry.payload))
+        if self.trouble or self._queue.qsize() >= QUEUE_MESSAGES:
+            return None, None
+        if size < OWN_CHUNK_BYTES:
+            return None, b"".join(entry.payload)
+        if (slot := self._slots.take(size)) is None:
+            return None, None
+        at = 0
+        for part in entry.payload:
+            slot[at : at + len(part)] = part
+            at += len(part)
+        return slot, memoryview(slot)[:size]
+
+    def _run(self) -> None:
+        flush_due = time.monotonic() + FLUSH_S
+        while True:
+            try:
+                item = self._queue.get(timeout=max(0.0, flush_due - time.monotonic()))
+            except Empty:
+                self._guarded(self.recording.flush)
+                flush_due = time.monotonic() + FLUSH_S
+                continue
+            if item is None:
+                break
+            entry, slot = item
+            self._guarded(self._write, entry)
+            if slot is not None:
+                self._slots.give(slot)
+            if time.monotonic() >= flush_due:
+                self._guarded(self.recording.flush)
+                flush_due = time.monotonic() + FLUSH_S
+        self._guarded(self.recording.finish)
+        if self._reserve is not None:
+            self._reserve.unlink(missing_ok=True)
+
+    def _write(self, entry: Entry) -> None:
+        if self.trouble:
+            self.dropped[entry.channel] += 1
+            return
+        self.recording.put(self._transform(entry))
+        if self._floor_bytes and (free := _free_bytes(self.recording.path.parent)) < self._floor_bytes:
+            self._stop(
+                f"disk nearly full ({free >> 20} MB left): recording closed; make room and start again"
+            )
+            self.recording.finish()
+
+    def _guarded(self, write: Callable[..., None], *arguments: Entry) -> None:
+        """A failed write ends the recording, not the thread: the queue is emptied and drops are counted."""
+        try:
+            write(*arguments)
+        except OSError as error:
+            if self._reserve is not None:
+                self._reserve.unlink(missing_ok=True)
+            self._stop(f"{error.strerror}: recording closed; make room and start again")
+            try:
+                self.recording.rescue()
+            except OSError as second:
+                self._stop(f"{second.strerror}: no index; endo3d recover {self.recording.parts[-1]}")
+
+    def _stop(self, why: str) -> None:
+        self.trouble = why
+        _log.error("%s", why)
+
+
+def _reserve(log: Path, size: int) -> Path | None:
+    """A file of ``size`` bytes, freed when the disk is full so that the summary still fits."""
+    log.parent.mkdir(parents=True, exist_ok=True)
+    if not size:
+        return None
+    path = log.with_name(f".{log.name}.reserve")
+    with path.open("wb") as file:
+        os.posix_fallocate(file.fileno(), 0, size)
+    return path
+
+
+def _free_bytes(directory: Path) -> int:
+    state = os.statvfs(directory)
+    return state.f_bavail * state.f_frsize
