@@ -72,7 +72,9 @@ def load(name: str) -> Any:
     module = importlib.import_module(_module(name))
     subcommands = getattr(module, "app", None)
     if subcommands is None:
-        subcommands = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode="rich")
+        subcommands = typer.Typer(
+            add_completion=False, pretty_exceptions_enable=False, rich_markup_mode="rich"
+        )
         subcommands.command(name)(getattr(module, name))
     command = typer.main.get_command(subcommands)
     command.name = name
@@ -96,9 +98,14 @@ def _version(wanted: bool) -> None:
         raise typer.Exit
 
 
-@app.callback(epilog="First steps: [bold]endo3d doctor[/], [bold]endo3d demo[/]. Each command explains itself: endo3d COMMAND --help.")
+@app.callback(
+    epilog="First steps: [bold]endo3d doctor[/], [bold]endo3d demo[/]. "
+    "Each command explains itself: endo3d COMMAND --help."
+)
 def endo3d(
-    version: bool = typer.Option(False, "--version", callback=_version, is_eager=True, help="Print the version."),
+    version: bool = typer.Option(
+        False, "--version", callback=_version, is_eager=True, help="Print the version."
+    ),
 ) -> None:
     """Live 3-D measurement through a hand-held fibre endoscope."""
 

@@ -22,7 +22,9 @@ def check(
     as_json: JsonOption = False,
     mermaid: Annotated[bool, typer.Option("--mermaid", help="The graph for a README.")] = False,
     dot: Annotated[bool, typer.Option("--dot", help="The graph for Graphviz.")] = False,
-    keys: Annotated[str, typer.Option("--keys", metavar="SERVICE", help="List the keys of a service's table.")] = "",
+    keys: Annotated[
+        str, typer.Option("--keys", metavar="SERVICE", help="List the keys of a service's table.")
+    ] = "",
 ) -> None:
     """Check a stack file and print its dataflow.
 

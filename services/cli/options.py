@@ -15,11 +15,18 @@ def complete_stack(incomplete: str) -> list[str]:
 
 StackArgument = Annotated[
     str,
-    typer.Argument(metavar="STACK", help="A stack file, or a stock stack's name.", autocompletion=complete_stack),
+    typer.Argument(
+        metavar="STACK", help="A stack file, or a stock stack's name.", autocompletion=complete_stack
+    ),
 ]
 StackOption = Annotated[
     str,
-    typer.Option("--stack", metavar="STACK", help="A stack file, or a stock stack's name.", autocompletion=complete_stack),
+    typer.Option(
+        "--stack",
+        metavar="STACK",
+        help="A stack file, or a stock stack's name.",
+        autocompletion=complete_stack,
+    ),
 ]
 SetOption = Annotated[
     list[str] | None,

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import Any
 
 from endo3d.schemas.topics import Topic
-
 from endo3d.services.runtime.errors import UserError
 from endo3d.services.runtime.stack_file import Entry, Stack
 
@@ -46,7 +45,8 @@ class Graph:
                 for entry in self.entries
             ],
             "edges": [
-                {"key": edge.topic.key(self.rig), "from": edge.writer, "to": edge.reader} for edge in self.edges
+                {"key": edge.topic.key(self.rig), "from": edge.writer, "to": edge.reader}
+                for edge in self.edges
             ],
         }
 

@@ -82,7 +82,9 @@ class Launcher:
     turns. Nothing is left running, even if this process is killed: see ``follow_parent``.
     """
 
-    def __init__(self, children: Sequence[Child], sink: Sink, environment: Mapping[str, str] | None = None) -> None:
+    def __init__(
+        self, children: Sequence[Child], sink: Sink, environment: Mapping[str, str] | None = None
+    ) -> None:
         self.children = list(children)
         self.sink = sink
         self.environment = {**_one_thread_each(), **os.environ, **(environment or {})}
@@ -126,7 +128,9 @@ class Launcher:
         if self.user_error:
             return EXIT_USER_ERROR
         fine = (0, None, -signal.SIGTERM)
-        return int(any(child.state is State.GIVEN_UP or child.exit_code not in fine for child in self.children))
+        return int(
+            any(child.state is State.GIVEN_UP or child.exit_code not in fine for child in self.children)
+        )
 
     def stop(self, grace_s: float = STOP_GRACE_S, hurry: Callable[[], bool] = lambda: False) -> None:
         """Stop all, sources first and one after the other, so that what is under way still arrives.
@@ -224,13 +228,18 @@ class Launcher:
             child.restarts = 0
         if child.restarts == len(BACKOFF_S):
             child.state = State.GIVEN_UP
-            self.sink(child.name, f"{describe_exit(code)}; given up after {child.restarts} restarts: see its lines above")
+            self.sink(
+                child.name,
+                f"{describe_exit(code)}; given up after {child.restarts} restarts: see its lines above",
+            )
             return
         wait_s = BACKOFF_S[child.restarts]
         child.restarts += 1
         child.total_restarts += 1
         child.state, child.restart_at_s = State.WAITING, time.monotonic() + wait_s
-        self.sink(child.name, f"{describe_exit(code)}; restart {child.restarts} of {len(BACKOFF_S)} in {wait_s} s")
+        self.sink(
+            child.name, f"{describe_exit(code)}; restart {child.restarts} of {len(BACKOFF_S)} in {wait_s} s"
+        )
 
     @staticmethod
     def _signal(child: Child, number: signal.Signals) -> None:

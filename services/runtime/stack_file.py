@@ -119,7 +119,9 @@ class Stack:
         paths = {
             key: str(self.base / Path(value).expanduser())
             for key, value in given.items()
-            if isinstance(value, str) and key in model.model_fields and _is_path(model.model_fields[key].annotation)
+            if isinstance(value, str)
+            and key in model.model_fields
+            and _is_path(model.model_fields[key].annotation)
         }
         try:
             return model.model_validate(known | given | paths)
@@ -138,7 +140,8 @@ class Stack:
         if first["type"] == "missing":
             return f"{where}: [{table}] needs the key {key!r}; add it{more}"
         what = first["msg"].removeprefix("Value error, ")
-        return f"{where}: {table}.{key} = {first['input']!r} is wrong: {what}; `endo3d check --keys {table}` lists what it takes{more}"
+        value = f"{table}.{key} = {first['input']!r}"
+        return f"{where}: {value} is wrong: {what}; `endo3d check --keys {table}` lists what it takes{more}"
 
     def _where(self, table: str, key: str = "") -> str:
         """``file:line`` of a key, or of its table."""
@@ -159,7 +162,9 @@ def load(source: str | Path, overrides: Sequence[str] = ()) -> Stack:
     return loads(text, overrides, path=path, base=Path.cwd() if stock else path.parent)
 
 
-def loads(text: str, overrides: Sequence[str] = (), *, path: Path | None = None, base: Path | None = None) -> Stack:
+def loads(
+    text: str, overrides: Sequence[str] = (), *, path: Path | None = None, base: Path | None = None
+) -> Stack:
     """Parse a stack's text, e.g. the one that a log carries."""
     label = str(path) if path else "stack"
     try:
@@ -169,7 +174,9 @@ def loads(text: str, overrides: Sequence[str] = (), *, path: Path | None = None,
     stray = [key for key, value in tables.items() if not isinstance(value, dict)]
     if stray:
         line = line_of(text, "", stray[0])
-        raise UserError(f"{label}:{line}: {stray[0]!r} stands outside of a table; move it below [rig] or a service")
+        raise UserError(
+            f"{label}:{line}: {stray[0]!r} stands outside of a table; move it below [rig] or a service"
+        )
     for override in overrides:
         _override(tables, override)
     if overrides:
@@ -235,10 +242,14 @@ def _plain_value(text: str) -> Any:
 
 def _toml_value(value: Any) -> str:
     if isinstance(value, dict):
-        return "{" + ", ".join(f"{key} = {_toml_value(item)}" for key, item in value.items()) + "}"
+        return (
+            "{" + ", ".join(f"{_toml_value(key)} = {_toml_value(item)}" for key, item in value.items()) + "}"
+        )
     if isinstance(value, list):
         return "[" + ", ".join(_toml_value(item) for item in value) + "]"
-    return json.dumps(value, ensure_ascii=False) if isinstance(value, str | bool | int) else str(value)
+    if isinstance(value, str | bool):
+        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")  # legal in JSON, not in TOML
+    return str(value)
 
 
 def _stock_or_file(what: str, name: str, kind: str, suffix: str, base: Path) -> tuple[Path, bool]:
@@ -261,7 +272,9 @@ def _service_class(module: str, where: str) -> type[Service[Any]]:
         loaded = importlib.import_module(qualified)
     except ModuleNotFoundError as error:
         if error.name == qualified or (error.name and qualified.startswith(error.name + ".")):
-            raise UserError(f"{where}: no service module {module!r}; {_nearest(module, service_modules())}") from None
+            raise UserError(
+                f"{where}: no service module {module!r}; {_nearest(module, service_modules())}"
+            ) from None
         raise UserError(f"service {module!r} needs the package {error.name!r}; pip install it") from None
     kinds = [
         kind
@@ -269,7 +282,9 @@ def _service_class(module: str, where: str) -> type[Service[Any]]:
         if inspect.isclass(kind) and issubclass(kind, Service) and kind.__module__ == loaded.__name__
     ]
     if len(kinds) != 1:
-        raise UserError(f"{where}: module {module!r} holds {len(kinds)} services, not one; name another module")
+        raise UserError(
+            f"{where}: module {module!r} holds {len(kinds)} services, not one; name another module"
+        )
     return kinds[0]
 
 
