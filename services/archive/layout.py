@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -85,11 +85,21 @@ def message_head(channel: int, sequence: int, log_ns: int, publish_ns: int, size
     )
 
 
-def message_index(channel: int, entries: Sequence[tuple[int, int]]) -> bytes:
-    """The index of a channel's messages (log time, offset within the records) in one chunk."""
-    size = INDEX_ENTRY.size * len(entries)
-    head = MESSAGE_INDEX.pack(OP_MESSAGE_INDEX, MESSAGE_INDEX.size - RECORD.size + size, channel, size)
-    return head + b"".join(INDEX_ENTRY.pack(*entry) for entry in entries)
+def message_indexes(
+    entries: Mapping[int, Sequence[tuple[int, int]]], at: int
+) -> tuple[bytes, dict[int, int]]:
+    """The message indexes of a chunk, to stand at offset ``at``, and where each channel's begins.
+
+    entries: channel -> (log time, offset within the records) of its messages.
+    """
+    out, offsets = bytearray(), {}
+    for channel, items in entries.items():
+        offsets[channel] = at + len(out)
+        size = INDEX_ENTRY.size * len(items)
+        out += MESSAGE_INDEX.pack(OP_MESSAGE_INDEX, MESSAGE_INDEX.size - RECORD.size + size, channel, size)
+        for item in items:
+            out += INDEX_ENTRY.pack(*item)
+    return bytes(out), offsets
 
 
 def chunk_around(records: Sequence[Buffer], start_ns: int, end_ns: int) -> bytes:

@@ -35,12 +35,13 @@ from endo3d.schemas.messages import Message
 from endo3d.schemas.topics import Topic
 from endo3d.services.archive import layout
 from endo3d.services.archive.layout import ChunkIndex
+from endo3d.services.runtime.errors import UserError
 
 FOOTER = struct.Struct("<QQI")
 _TAIL_BYTES = layout.RECORD.size + FOOTER.size + len(layout.MAGIC)
 
 
-class Unreadable(Exception):
+class Unreadable(UserError):
     """This file can't be read as a log; the text says why and what to do."""
 
 
@@ -152,7 +153,7 @@ class Log:
         end_ns: int = 1 << 63,
         check: bool = True,
     ) -> Iterator[Record]:
-        """Messages in the order they arrived, ``start_ns <= log_ns < end_ns``; without ``wanted`` all of them.
+        """Messages as they arrived, ``start_ns <= log_ns < end_ns``; of all topics without ``wanted``.
 
         With ``check`` every chunk's CRC is verified. Raises ``Unreadable`` at a damaged chunk.
         """

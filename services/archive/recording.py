@@ -9,7 +9,8 @@ from pathlib import Path
 
 from endo3d.services.archive.entry import Attachment, Entry
 from endo3d.services.archive.facts import LIBRARY
-from endo3d.services.archive.writer import FileSink, Sink, Writer
+from endo3d.services.archive.sink import FileSink, Sink
+from endo3d.services.archive.writer import Writer
 
 NS_PER_S = 1_000_000_000
 
