@@ -52,9 +52,8 @@ def _read_image(proto: Any, data: memoryview) -> NDArray[Any]:
             f"{height} rows of {step} bytes for {width} {proto.encoding} pixels, in {len(data)} bytes"
         )
     if step == row:
-        image = np.frombuffer(data, dtype).reshape(height, width)
-    else:
-        image = np.frombuffer(data, np.uint8).reshape(height, step)[:, :row].copy().view(dtype)
+        return np.ndarray((height, width), dtype, data)
+    image = np.ndarray((height, row), np.uint8, data, strides=(step, 1)).copy().view(dtype)
     image.flags.writeable = False
     return image
 
@@ -120,10 +119,7 @@ def read_depth(proto: Any, data: memoryview) -> DepthMap:
 
 
 def _fill_points(proto: Any, stored: NDArray[Any]) -> None:
-    for name, offset, number in points.fields_of(stored.dtype):
-        proto.fields.add(name=name, offset=offset, type=number)
-    proto.point_stride = stored.itemsize
-    proto.pose.orientation.w = 1.0
+    proto.MergeFromString(points.layout_of(stored.dtype))
 
 
 def fill_cloud(proto: Any, cloud: Cloud) -> None:
@@ -149,6 +145,8 @@ def read_cloud(proto: Any, data: memoryview) -> Cloud:
     label, ours = proto.label, proto.HasField("label")
     dtype = points.read_fields(proto)
     shape = (label.height, label.width) if ours else (1, len(data) // dtype.itemsize)
+    if not all(shape):
+        raise Malformed(f"a cloud of {shape} points")
     stored = points.as_point(points.view_points(data, dtype, shape))
     stamp_ns = read_stamp(proto.timestamp)
     return Cloud(

@@ -15,6 +15,7 @@ Foreign writers may put the array anywhere and leave our label out: ``decode`` r
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -48,31 +49,44 @@ DATA = 6
 """Number of the field ``data``, in foxglove.RawImage and in foxglove.PointCloud."""
 
 Buffer = memoryview | bytes | bytearray | NDArray[np.uint8]
-Fill = Callable[[Any, Any], None]
 
-_WITH_ARRAY: dict[Topic, tuple[str, Fill, Callable[[Any, memoryview], Message]]] = {
-    topics.FRAME: ("image", arrays.fill_frame, arrays.read_frame),
-    topics.CLOUD: ("points", arrays.fill_cloud, arrays.read_cloud),
-    topics.DEPTH: ("depth", arrays.fill_depth, arrays.read_depth),
-    topics.MAP: ("points", arrays.fill_map, arrays.read_map),
-}
-"""The large array's name, and the two ways across."""
-_SMALL: dict[Topic, tuple[Fill, Callable[[Any], Message]]] = {
-    topics.POSE: (small.fill_pose, small.read_pose),
-    topics.TRANSFORM: (small.fill_frame_transform, small.read_frame_transform),
-    topics.MODE: (small.fill_mode, small.read_mode),
-    topics.CAMERA: (small.fill_camera, small.read_camera),
-    topics.PROJECTOR: (small.fill_projector, small.read_projector),
-    topics.TRUTH: (small.fill_truth, small.read_truth),
-    topics.STATUS: (small.fill_status, small.read_status),
-    topics.LOG: (small.fill_log, small.read_log),
+
+@dataclass(frozen=True, slots=True)
+class _Way:
+    """How the messages of one topic cross."""
+
+    topic: Topic
+    fill: Callable[[Any, Any], None]
+    """Writes everything but the large array into an empty protobuf message."""
+    read: Callable[..., Message]
+    """Takes the protobuf message, and the array's bytes if there is an array."""
+    array: str = ""
+    """The large array's name."""
+
+
+_WAYS = {
+    way.topic.name: way
+    for way in (
+        _Way(topics.FRAME, arrays.fill_frame, arrays.read_frame, "image"),
+        _Way(topics.CLOUD, arrays.fill_cloud, arrays.read_cloud, "points"),
+        _Way(topics.DEPTH, arrays.fill_depth, arrays.read_depth, "depth"),
+        _Way(topics.MAP, arrays.fill_map, arrays.read_map, "points"),
+        _Way(topics.POSE, small.fill_pose, small.read_pose),
+        _Way(topics.TRANSFORM, small.fill_frame_transform, small.read_frame_transform),
+        _Way(topics.MODE, small.fill_mode, small.read_mode),
+        _Way(topics.CAMERA, small.fill_camera, small.read_camera),
+        _Way(topics.PROJECTOR, small.fill_projector, small.read_projector),
+        _Way(topics.TRUTH, small.fill_truth, small.read_truth),
+        _Way(topics.STATUS, small.fill_status, small.read_status),
+        _Way(topics.LOG, small.fill_log, small.read_log),
+    )
 }
 
 
 def array_of(message: Message) -> NDArray[Any] | None:
     """The large array of a bulk message, None of any other."""
     topic = topics.of(message)
-    return _array(topic, message) if topic.bulk else None
+    return getattr(message, _WAYS[topic.name].array) if topic.bulk else None
 
 
 def encoded_size(message: Message) -> int:
@@ -88,14 +102,14 @@ def encode_into(message: Message, buffer: Buffer) -> int:
     """
     array = _bulk_array(message)
     size = DATA_OFFSET + array.nbytes
-    sample = np.frombuffer(buffer, np.uint8)[:size]
+    sample = np.frombuffer(buffer, np.uint8)
     if len(sample) < size:
         raise ValueError(f"{size} bytes don't fit into {len(sample)}")
-    front_bytes = front(_serialise(topics.of(message), message), DATA, array.nbytes, DATA_OFFSET)
-    place = sample[DATA_OFFSET:].view(array.dtype).reshape(array.shape)
-    if _address(place) != _address(array) or not array.flags.c_contiguous:
-        place[...] = array
-    sample[:DATA_OFFSET] = np.frombuffer(front_bytes, np.uint8)
+    header = _serialise(_WAYS[topics.of(message).name], message)
+    before = front(header, DATA, array.nbytes, DATA_OFFSET)
+    if not array.flags.c_contiguous or _address(array) != _address(sample) + DATA_OFFSET:
+        np.ndarray(array.shape, array.dtype, sample, DATA_OFFSET)[...] = array
+    sample.data[:DATA_OFFSET] = before
     return size
 
 
@@ -104,19 +118,20 @@ def encode(message: Message) -> bytes:
 
     Equal messages give equal bytes. Raises ``ValueError`` or ``TypeError`` for values that don't fit.
     """
-    topic = topics.of(message)
-    header = _serialise(topic, message)
-    if topic not in _WITH_ARRAY:
+    way = _WAYS[topics.of(message).name]
+    header = _serialise(way, message)
+    if not way.array:
         return header
-    array = np.ascontiguousarray(_array(topic, message))
+    array = np.ascontiguousarray(getattr(message, way.array))
     # A map's header grows with the keys it removes; a bulk message's always fits.
-    offset = DATA_OFFSET if topic.bulk else room(header, DATA, array.nbytes, ALIGNMENT)
-    return front(header, DATA, array.nbytes, offset) + array.tobytes()
+    offset = DATA_OFFSET if way.topic.bulk else room(header, DATA, array.nbytes, ALIGNMENT)
+    return b"".join((front(header, DATA, array.nbytes, offset), array.reshape(-1).view(np.uint8).data))
 
 
 def data_span(buffer: Buffer) -> tuple[int, int]:
     """Where the array of an encoded message with one starts and ends. Raises ``Malformed``."""
-    return span(memoryview(buffer).cast("B"), DATA)[1:]
+    _, start, stop = span(_view(buffer), DATA)
+    return start, stop
 
 
 def decode(topic: Topic, buffer: Buffer) -> Message:
@@ -124,14 +139,19 @@ def decode(topic: Topic, buffer: Buffer) -> Message:
 
     Raises ``Malformed``, and nothing else, for bytes that are not such a message.
     """
-    view = memoryview(buffer).toreadonly().cast("B")
+    way = _WAYS[topic.name]
+    view = _view(buffer)
     try:
-        if topic not in _WITH_ARRAY:
-            return _SMALL[topic][1](_parse(topic, bytes(view)))
-        read = _WITH_ARRAY[topic][2]
-        return read(*(_split_ours(topic, view) or _split(topic, view)))
+        if not way.array:
+            return way.read(_parse(topic, bytes(view)))
+        return way.read(*(_split_ours(topic, view) or _split(topic, view)))
     except Malformed as error:
         raise Malformed(f"{topic.name}: {error}") from None
+
+
+def _view(buffer: Buffer) -> memoryview:
+    """Read-only bytes. (For mypy an ndarray is a buffer only from Python 3.12 on.)"""
+    return memoryview(buffer).toreadonly().cast("B")  # type: ignore[arg-type]
 
 
 def _split_ours(topic: Topic, view: memoryview) -> tuple[Any, memoryview] | None:
@@ -155,11 +175,6 @@ def _split(topic: Topic, view: memoryview) -> tuple[Any, memoryview]:
     return _parse(topic, bytes(view[:field]) + bytes(view[stop:])), view[start:stop]
 
 
-def _array(topic: Topic, message: Message) -> NDArray[Any]:
-    array: NDArray[Any] = getattr(message, _WITH_ARRAY[topic][0])
-    return array
-
-
 def _bulk_array(message: Message) -> NDArray[Any]:
     array = array_of(message)
     if array is None:
@@ -168,14 +183,14 @@ def _bulk_array(message: Message) -> NDArray[Any]:
 
 
 def _address(array: NDArray[Any]) -> int:
-    address: int = array.__array_interface__["data"][0]
+    """Of the first byte. (The interface of a structured array would list its fields, which takes 5 us.)"""
+    address: int = array.view(np.uint8).__array_interface__["data"][0]
     return address
 
 
-def _serialise(topic: Topic, message: Message) -> bytes:
-    proto = message_class(topic)()
-    fill = _WITH_ARRAY[topic][1] if topic in _WITH_ARRAY else _SMALL[topic][0]
-    fill(proto, message)
+def _serialise(way: _Way, message: Message) -> bytes:
+    proto = message_class(way.topic)()
+    way.fill(proto, message)
     serialised: bytes = proto.SerializeToString(deterministic=True)
     return serialised
 

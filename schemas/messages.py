@@ -69,7 +69,7 @@ class Cloud:
     @property
     def channels(self) -> NDArray[np.float32]:
         """(height, width, 6) float32 view: x, y, z, intensity, quality, sigma."""
-        return self.points.view(np.float32).reshape(*self.points.shape, len(POINT))
+        return self.points.view(np.float32).reshape(*self.points.shape, len(POINT.names or ()))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

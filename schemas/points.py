@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
 from foxglove_schemas_protobuf.PackedElementField_pb2 import PackedElementField
+from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
 from numpy.typing import NDArray
 
 from endo3d.schemas.messages import POINT
@@ -25,30 +26,35 @@ _NUMBER: dict[str, int] = {
 }
 _DTYPE = {number: text for text, number in _NUMBER.items()}
 
-FieldText = tuple[str, int, int]
-"""Name, offset in bytes, ``foxglove.NumericType``."""
+Described = tuple[str, int, int]
+"""Name, offset in bytes and ``foxglove.NumericType`` of a field."""
 
 
-@lru_cache
-def fields_of(dtype: np.dtype[Any]) -> tuple[FieldText, ...]:
-    """Name, offset and type of every field of a structured dtype, in its own order.
+@lru_cache(maxsize=32)
+def layout_of(dtype: np.dtype[Any]) -> bytes:
+    """The part of a serialised ``foxglove.PointCloud`` that says how points of ``dtype`` lie.
 
     Raises ``ValueError`` for a field Foxglove has no type for.
     """
     if not dtype.names or dtype.fields is None:
         raise ValueError(f"points are structured; {dtype} has no fields")
-    described = []
+    proto = PointCloud(point_stride=dtype.itemsize)
+    proto.pose.orientation.w = 1.0
     for name in dtype.names:
         kind, offset = dtype.fields[name][:2]
         if kind.str not in _NUMBER:
             raise ValueError(f"field {name!r} has the type {kind}, which a PointCloud can't name")
-        described.append((name, offset, _NUMBER[kind.str]))
-    return tuple(described)
+        proto.fields.add(name=name, offset=offset, type=_NUMBER[kind.str])
+    serialised: bytes = proto.SerializeToString()
+    return serialised
 
 
 @lru_cache(maxsize=32)
-def dtype_of(fields: tuple[FieldText, ...], stride: int) -> np.dtype[Any]:
-    """The structured dtype that PointCloud fields describe. Raises ``Malformed``."""
+def dtype_of(fields: tuple[Described, ...], stride: int) -> np.dtype[Any]:
+    """The structured dtype that PointCloud fields describe, ``POINT`` itself if it is that.
+
+    Raises ``Malformed``.
+    """
     if not fields:
         raise Malformed("the points have no fields")
     for name, offset, number in fields:
@@ -57,7 +63,7 @@ def dtype_of(fields: tuple[FieldText, ...], stride: int) -> np.dtype[Any]:
         if offset + np.dtype(_DTYPE[number]).itemsize > stride:
             raise Malformed(f"field {name!r} ends after the point's {stride} bytes")
     try:
-        return np.dtype(
+        dtype = np.dtype(
             {
                 "names": [name for name, _, _ in fields],
                 "formats": [_DTYPE[number] for _, _, number in fields],
@@ -67,6 +73,7 @@ def dtype_of(fields: tuple[FieldText, ...], stride: int) -> np.dtype[Any]:
         )
     except (ValueError, OverflowError, MemoryError) as error:
         raise Malformed(f"the point's fields make no layout: {error}") from error
+    return POINT if dtype == POINT else dtype
 
 
 def read_fields(proto: Any) -> np.dtype[Any]:
@@ -74,22 +81,15 @@ def read_fields(proto: Any) -> np.dtype[Any]:
     return dtype_of(tuple((f.name, f.offset, f.type) for f in proto.fields), proto.point_stride)
 
 
-def view_points(data: memoryview, dtype: np.dtype[Any], shape: Sequence[int]) -> NDArray[Any]:
-    """Read-only points over ``data``; raises ``Malformed`` when they are not ``shape``."""
-    count = 1
-    for length in shape:
-        count *= length
-    if count * dtype.itemsize != len(data):
-        raise Malformed(
-            f"{tuple(shape)} points of {dtype.itemsize} bytes need another size than {len(data)} bytes"
-        )
-    points = np.frombuffer(data, dtype).reshape(shape) if count else np.empty(shape, dtype)
-    points.flags.writeable = False
-    return points
+def view_points(data: memoryview, dtype: np.dtype[Any], shape: tuple[int, ...]) -> NDArray[Any]:
+    """Points over ``data``; raises ``Malformed`` when they are not ``shape``."""
+    if math.prod(shape) * dtype.itemsize != len(data):
+        raise Malformed(f"{shape} points of {dtype.itemsize} bytes need another size than {len(data)} bytes")
+    return np.ndarray(shape, dtype, data)
 
 
 def as_point(points: NDArray[Any]) -> NDArray[Any]:
-    """Foreign points as ``POINT``: themselves where the layout is equal, else a copy, NaN for what is absent."""
+    """Foreign points as ``POINT``: themselves if they are that, else a copy, NaN where a field is absent."""
     if points.dtype == POINT:
         return points
     names = points.dtype.names or ()

@@ -92,14 +92,14 @@ def _build(file: FileDescriptor, name: str, label: str | None) -> tuple[Schema, 
     return Schema(name, "protobuf", data), GetMessageClass(pool.FindMessageTypeByName(name))
 
 
-_BUILT = {topic: _build(*source) for topic, source in _SOURCES.items()}
+_BUILT = {topic.name: _build(*source) for topic, source in _SOURCES.items()}
 
 
 def schema(topic: Topic) -> Schema:
     """Name, encoding and descriptors of a topic's messages, as MCAP stores them."""
-    return _BUILT[topic][0]
+    return _BUILT[topic.name][0]
 
 
 def message_class(topic: Topic) -> type[Any]:
     """The protobuf class of a topic, with ``label`` and ``padding`` where it has them."""
-    return _BUILT[topic][1]
+    return _BUILT[topic.name][1]

@@ -7,6 +7,7 @@ a foreign writer leaves out is NaN.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -38,7 +39,7 @@ _LEVEL = {level: LogProto.Level.Value(level.name) for level in Level}
 _LEVEL_OF = {number: level for level, number in _LEVEL.items()} | {LogProto.UNKNOWN: Level.INFO}
 
 
-def _known(table: dict[int, Any], number: int, what: str) -> Any:
+def _known(table: Mapping[Any, Any], number: int, what: str) -> Any:
     if number not in table:
         raise Malformed(f"{what} {number} is unknown")
     return table[number]

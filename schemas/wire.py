@@ -91,11 +91,13 @@ def front(header: bytes, number: int, length: int, offset: int) -> bytes:
     Raises ``ValueError`` when the header is too long for that.
     """
     last = field_front(number, length)
-    zeros = offset - len(header) - len(last) - _PADDING_FRONT
+    end = offset - len(last)
+    zeros = end - len(header) - _PADDING_FRONT
     if zeros < 0:
         raise ValueError(f"a header of {len(header)} bytes is {-zeros} too long: shorten its texts")
     # The padding's length always takes two bytes, so that every gap can be filled.
-    return b"".join((header, _PADDING_TAG, bytes((zeros & 0x7F | 0x80, zeros >> 7)), bytes(zeros), last))
+    padding = _PADDING_TAG + bytes((zeros & 0x7F | 0x80, zeros >> 7))
+    return (header + padding).ljust(end, b"\0") + last
 
 
 def room(header: bytes, number: int, length: int, step: int) -> int:
