@@ -1,0 +1,285 @@
+"""The bus: messages and commands between the processes of a rig, over zenoh and shared memory.
+
+Large arrays travel without a copy: ``loan`` lends an array that lies in shared memory already, ``publish``
+seals it in place, and a reader's message is a view of the very same memory. Where that is not to be had
+(memory locking forbidden, another zenoh release) the bus copies, and says so in ``note``.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import threading
+import time
+from collections.abc import Callable, Mapping
+from importlib.metadata import version
+from types import TracebackType
+from typing import Any, Final, Self
+
+import zenoh
+from numpy.typing import DTypeLike, NDArray
+from zenoh.handlers import FifoChannel
+
+from endo3d.schemas import codec, topics
+from endo3d.schemas.messages import LogLine, Message, Status
+from endo3d.schemas.topics import Topic
+from endo3d.services.runtime import pool
+from endo3d.services.runtime.errors import UserError
+from endo3d.services.runtime.memory import Memory
+from endo3d.services.runtime.reader import Reader
+from endo3d.services.runtime.service import Exhausted, Refused, Sample, plain_loan
+from endo3d.services.runtime.session import lockable, meeting_port, open_session
+from endo3d.services.runtime.shm_view import View
+from endo3d.services.runtime.tally import Tally
+from endo3d.services.runtime.writer import Writer
+
+log = logging.getLogger(__name__)
+
+_ASK_AGAIN_S: Final = 0.02
+
+Command = Callable[[str, Mapping[str, Any]], Mapping[str, Any]]
+"""(verb, parameters) -> reply; raises ``Refused``."""
+
+
+class Bus:
+    """One process's place on the bus of a rig. Make it with ``Bus.open``; it is a context manager."""
+
+    def __init__(
+        self, rig: str, name: str, session: zenoh.Session, memory: Memory | None, view: View | None, note: str
+    ) -> None:
+        self.rig = rig
+        self.name = name
+        self.note = note
+        """Why this process is slower than it could be; empty when it isn't."""
+        self.tally = Tally()
+        self._session = session
+        self._memory = memory
+        self._view = view
+        self._writers: dict[str, Writer] = {}
+        self._readers: list[Reader] = []
+        self._queryables: list[zenoh.Queryable[Any]] = []
+        self._tokens: list[zenoh.LivelinessToken] = []
+        self._named: set[str] = set()
+        self._lock = threading.Lock()
+
+    @classmethod
+    def open(
+        cls,
+        rig: str,
+        *,
+        name: str = "",
+        port: int | None = None,
+        shm_mb: int = 512,
+        shared_memory: bool = True,
+        settings: Mapping[str, Any] | None = None,
+    ) -> Self:
+        """Join a rig's bus as ``name``.
+
+        port: the first of three loopback ports where the rig meets, by default derived from its name.
+        shm_mb: what all pools of the rig together may take, and every process must be able to lock.
+        settings: zenoh configuration over the built-in one, path -> value.
+        Raises ``UserError`` with what to do.
+        """
+        note, view, memory = "", None, None
+        if not shared_memory:
+            note = "shared memory is switched off: large messages go over the loopback network"
+        elif not lockable(shm_mb << 20):
+            note = (
+                f"may not lock {shm_mb} MB of memory: large messages go over the loopback network; "
+                "raise the limit (ulimit -l unlimited, LimitMEMLOCK=infinity, --ulimit memlock=-1)"
+            )
+        else:
+            try:
+                view = pool.self_test()
+            except zenoh.ZError as error:
+                note = f"no shared memory ({error}): large messages go over the network; see endo3d doctor"
+            else:
+                memory = Memory(view)
+                if view is None:
+                    note = f"no zero-copy view in zenoh {version('eclipse-zenoh')}: large messages are copied"
+        if note:
+            log.warning(note)
+        session = open_session(
+            meeting_port(rig) if port is None else port, shared_memory=memory is not None, settings=settings
+        )
+        return cls(rig, name, session, memory, view, note)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def stop_reading(self) -> None:
+        """No more messages and commands; when it returns, all handlers have returned."""
+        for token in self._tokens:
+            token.undeclare()
+        for queryable in self._queryables:
+            queryable.undeclare()
+        for reader in self._readers:
+            reader.close()
+        self._tokens, self._queryables, self._readers = [], [], []
+
+    def close(self) -> None:
+        """Stop reading, then leave."""
+        self.stop_reading()
+        self._session.close()
+
+    # ---------------------------------------------------------------- messages
+
+    def loan(self, topic: Topic, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
+        """An uninitialised array whose publication copies nothing; raises ``Exhausted``, counted.
+
+        Write it before it is published, never after.
+        """
+        if self._memory is None:
+            return plain_loan(topic, shape, dtype)
+        try:
+            return self._memory.lend(topic, shape, dtype)
+        except Exhausted:
+            self.tally.drop(topic.name, "exhausted")
+            raise
+
+    def publish(self, message: Message) -> None:
+        """Put a message on its topic; counted and dropped when shared memory is exhausted."""
+        topic = topics.of(message)
+        try:
+            payload = codec.encode(message) if self._memory is None else self._memory.payload(topic, message)
+        except Exhausted:
+            self.tally.drop(topic.name, "exhausted")
+            return
+        source = message.service if isinstance(message, Status | LogLine) else self.name
+        self._writer(topic, topic.key(self.rig, source)).put(payload)
+        self.tally.publish(topic.name)
+
+    def subscribe(
+        self, topic: Topic, handler: Callable[[Message], None], *, depth: int | None = None
+    ) -> None:
+        """Call ``handler`` with every message of ``topic``, in a thread of its own.
+
+        ``depth``: samples that may wait, by default the topic's. Malformed ones are counted and dropped.
+        """
+
+        def deliver(sample: Sample) -> None:
+            message = self._decoded(sample)
+            if message is not None:
+                handler(message)
+
+        self.subscribe_encoded(topic, deliver, depth=depth)
+
+    def subscribe_encoded(
+        self, topic: Topic, handler: Callable[[Sample], None], *, depth: int | None = None
+    ) -> None:
+        """The same with samples as they travelled."""
+        reader = Reader(
+            self._session, topic.key(self.rig), topic, handler, self._view, self.tally, depth or topic.depth
+        )
+        self._readers.append(reader)
+        reader.start()
+
+    def intact(self) -> bool:
+        """Whether all shared memory that readers of this process still look at is what was sent.
+
+        To ask before a result goes out: after a stop of this process its writers may have taken memory back.
+        """
+        return all(reader.intact() for reader in self._readers)
+
+    # ---------------------------------------------------------------- commands
+
+    def serve(self, handler: Command) -> None:
+        """Answer commands to this process's service, one at a time, in a thread of its own."""
+        key = topics.control_key(self.rig, self.name, "*")
+        queryable = self._session.declare_queryable(key, FifoChannel(16))
+        self._queryables.append(queryable)
+        threading.Thread(target=_answer_all, args=(queryable, handler), name="serve", daemon=True).start()
+
+    def call(
+        self, service: str, verb: str, parameters: Mapping[str, Any] | None = None, timeout_s: float = 5.0
+    ) -> dict[str, Any]:
+        """Command a service and return its reply.
+
+        Raises ``Refused`` with the service's reason, ``UserError`` when it does not answer.
+        """
+        key = topics.control_key(self.rig, service, verb)
+        payload = json.dumps(dict(parameters or {}))
+        deadline = time.monotonic() + timeout_s
+        while (left_s := deadline - time.monotonic()) > 0:
+            for reply in self._session.get(
+                key, payload=payload, encoding=zenoh.Encoding.APPLICATION_JSON, timeout=left_s
+            ):
+                if reply.ok is not None:
+                    answer: dict[str, Any] = json.loads(reply.ok.payload.to_bytes())
+                    return answer
+                if reply.err is not None and reply.err.encoding == zenoh.Encoding.APPLICATION_JSON:
+                    raise Refused(json.loads(reply.err.payload.to_bytes())["error"])
+            time.sleep(_ASK_AGAIN_S)
+        raise UserError(f"{service} does not answer on rig {self.rig}; is it running? (endo3d top)")
+
+    # ---------------------------------------------------------------- who is there
+
+    def declare_alive(self) -> None:
+        """From now on others see this process's service."""
+        key = topics.alive_key(self.rig, self.name)
+        self._tokens.append(self._session.liveliness().declare_token(key))
+
+    def alive(self) -> set[str]:
+        """The services that are there now."""
+        replies = self._session.liveliness().get(topics.alive_key(self.rig, "*"), timeout=1.0)
+        return {_last_part(reply.ok.key_expr) for reply in replies if reply.ok is not None}
+
+    def watch_alive(self, handler: Callable[[str, bool], None]) -> None:
+        """Call ``handler(service, is_there)`` for all that are there, and whenever one comes or goes."""
+
+        def deliver(sample: zenoh.Sample) -> None:
+            handler(_last_part(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
+
+        self._session.liveliness().declare_subscriber(topics.alive_key(self.rig, "*"), deliver, history=True)
+
+    # ---------------------------------------------------------------- within
+
+    def _writer(self, topic: Topic, key: str) -> Writer:
+        with self._lock:
+            if key not in self._writers:
+                self._writers[key] = Writer(self._session, topic, key)
+            return self._writers[key]
+
+    def _decoded(self, sample: Sample) -> Message | None:
+        try:
+            return codec.decode(sample.topic, sample.payload)
+        except codec.Malformed as error:
+            name = sample.topic.name
+            self.tally.drop(name, "malformed")
+            if name not in self._named:
+                self._named.add(name)
+                log.warning("malformed messages on %s are dropped, the first: %s", name, error)
+            return None
+
+
+def _answer_all(queryable: zenoh.Queryable[Any], handler: Command) -> None:
+    for query in queryable.handler:
+        with query:  # the caller waits until the query is let go
+            _answer(query, handler)
+
+
+def _answer(query: zenoh.Query, handler: Command) -> None:
+    verb = _last_part(query.key_expr)
+    try:
+        parameters = json.loads(query.payload.to_bytes()) if query.payload else {}
+        reply = handler(verb, parameters)
+    except (Refused, json.JSONDecodeError) as error:
+        _refuse(query, str(error))
+    except Exception as error:
+        log.exception("command %s failed", verb)
+        _refuse(query, f"{verb} failed: {error}")
+    else:
+        query.reply(query.key_expr, json.dumps(dict(reply)), encoding=zenoh.Encoding.APPLICATION_JSON)
+
+
+def _refuse(query: zenoh.Query, reason: str) -> None:
+    query.reply_err(json.dumps({"error": reason}), encoding=zenoh.Encoding.APPLICATION_JSON)
+
+
+def _last_part(key: zenoh.KeyExpr) -> str:
+    return str(key).rsplit("/", 1)[-1]

@@ -1,0 +1,110 @@
+"""A subscription: a short ring of samples and the thread that works them off."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import threading
+import time
+import weakref
+from collections.abc import Callable
+from typing import Final
+
+import numpy as np
+import zenoh
+from numpy.typing import NDArray
+from zenoh.ext import AdvancedSubscriber, HistoryConfig, declare_advanced_subscriber
+from zenoh.handlers import Handler, RingChannel
+
+from endo3d.schemas.topics import Topic
+from endo3d.services.runtime.service import Sample
+from endo3d.services.runtime.shm_view import Chunk, View
+from endo3d.services.runtime.tally import Tally
+
+log = logging.getLogger(__name__)
+
+_SEQUENCES: Final = 1 << 32
+"""zenoh counts a writer's samples with 32 bits."""
+
+
+class Reader(threading.Thread):
+    """Takes samples of one topic. The ring drops its oldest when the work is slower than the writer: a reader
+    never holds the writer back, and never holds more than ``topic.depth`` chunks of its memory.
+    """
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        key: str,
+        topic: Topic,
+        deliver: Callable[[Sample], None],
+        view: View | None,
+        tally: Tally,
+        depth: int,
+    ) -> None:
+        super().__init__(name=f"read {topic.name}", daemon=True)
+        self._topic = topic
+        self._deliver = deliver
+        self._view = view
+        self._tally = tally
+        self._expected: dict[str, int] = {}
+        self._chunks: weakref.WeakSet[Chunk] = weakref.WeakSet()
+        self._subscriber = _subscribe(session, key, topic, depth)
+
+    def run(self) -> None:
+        with contextlib.suppress(zenoh.ZError):  # the ring is closed
+            for sample in self._subscriber.handler:
+                self._take(sample)
+
+    def close(self) -> None:
+        """Ends the thread after the sample it works on."""
+        self._subscriber.undeclare()
+        if threading.current_thread() is not self:
+            self.join()
+
+    def intact(self) -> bool:
+        """Whether every piece of shared memory that is still looked at here is what was sent."""
+        return all(chunk.is_valid() for chunk in tuple(self._chunks))
+
+    def _take(self, sample: zenoh.Sample) -> None:
+        received_ns = time.time_ns()
+        topic = self._topic.name
+        self._tally.receive(topic)
+        missed = self._missed(sample)
+        if missed:
+            self._tally.drop(topic, "missed", missed)
+        chunk, content = self._content(sample.payload)
+        source = str(sample.key_expr).rsplit("/", 1)[-1] if self._topic.per_service else ""
+        valid = chunk.is_valid if chunk is not None else lambda: True
+        self._deliver(Sample(self._topic, source, content.data, received_ns, valid))
+
+    def _content(self, payload: zenoh.ZBytes) -> tuple[Chunk | None, NDArray[np.uint8]]:
+        """The payload's bytes, (size,) uint8, and the shared memory that they are a view of, if they are."""
+        owner = payload.as_shm() if self._view is not None else None
+        if owner is None or self._view is None:
+            return None, np.frombuffer(payload.to_bytes(), np.uint8)
+        chunk = self._view(owner, len(payload))
+        self._chunks.add(chunk)
+        return chunk, chunk.array()
+
+    def _missed(self, sample: zenoh.Sample) -> int:
+        """Samples of the same writer between the last one taken and this one."""
+        source = sample.source_info
+        if source is None:
+            return 0
+        writer = f"{source.source_id.zid}/{source.source_id.eid}"
+        sequence: int = source.source_sn
+        missed = (sequence - self._expected.get(writer, sequence)) % _SEQUENCES
+        self._expected[writer] = sequence + 1
+        return missed if missed < _SEQUENCES // 2 else 0
+
+
+def _subscribe(
+    session: zenoh.Session, key: str, topic: Topic, depth: int
+) -> zenoh.Subscriber[Handler[zenoh.Sample]] | AdvancedSubscriber[Handler[zenoh.Sample]]:
+    ring: RingChannel[zenoh.Sample] = RingChannel(depth)
+    if not topic.latched:
+        return session.declare_subscriber(key, ring)
+    return declare_advanced_subscriber(
+        session, key, ring, history=HistoryConfig(detect_late_publishers=True, max_samples=1)
+    )
