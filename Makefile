@@ -1,4 +1,4 @@
-# Each target is one command; the first one run makes .venv and installs what was tested (constraints.txt).
+# Each target is one command; the first one run makes .venv and installs what was tested (deploy/constraints.txt).
 
 PYTHON ?= python3
 BIN := .venv/bin
@@ -13,11 +13,11 @@ help:
 	@echo "make bench    the numbers, with this machine's name"
 	@echo "make wheel    build dist/endo3d-*.whl"
 
-$(INSTALLED): pyproject.toml constraints.txt
+$(INSTALLED): pyproject.toml deploy/constraints.txt
 	@$(PYTHON) -c "import sys; sys.exit(sys.version_info < (3, 11))" || { \
 	  echo "endo3d needs Python 3.11 or newer; try: make PYTHON=python3.12 $(MAKECMDGOALS)"; exit 2; }
 	@test -x $(BIN)/python || $(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint deploy/constraints.txt --editable '.[dev]'
 	@touch $@
 
 demo: $(INSTALLED)

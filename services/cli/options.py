@@ -32,5 +32,10 @@ SetOption = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="TABLE.KEY=VALUE", help="Override one key of the stack file; repeatable."),
 ]
-RigOption = Annotated[str, typer.Option("--rig", help="The rig's name, as in [rig] of its stack file.")]
+RigOption = Annotated[
+    str,
+    typer.Option(
+        "--rig", envvar="ENDO3D_RIG", help="The rig's name as in its stack file, or the file (.toml)."
+    ),
+]
 JsonOption = Annotated[bool, typer.Option("--json", help="Machine-readable output.")]

@@ -1,0 +1,1 @@
+"""Measurements: each module is one, ``python -m bench.NAME``; ``python -m bench.run`` runs them in turn."""
