@@ -86,9 +86,7 @@ class Recording:
             if size <= self._split_bytes and entry.log_ns - self._part_start_ns < self._split_ns:
                 return writer
             self.finish()
-        path = self.path
-        if self._numbered:
-            path = path.with_name(f"{path.stem}_{len(self.parts):03d}{path.suffix}")
+        path = self._unused_path()
         path.parent.mkdir(parents=True, exist_ok=True)
         self._writer = writer = Writer(self._open_sink(path), LIBRARY)
         self.parts.append(path)
@@ -99,6 +97,18 @@ class Recording:
         for latched in self._latched.values():
             _write(writer, latched)
         return writer
+
+    def _unused_path(self) -> Path:
+        """The next part's; never that of an existing log, which may be waiting to be recovered."""
+        stem, suffix = self.path.stem, self.path.suffix
+        if self._numbered:
+            stem = f"{stem}_{len(self.parts):03d}"
+        path = self.path.with_name(stem + suffix)
+        again = 1
+        while path.exists():
+            again += 1
+            path = self.path.with_name(f"{stem}-{again}{suffix}")
+        return path
 
 
 def _write(writer: Writer, entry: Entry) -> None:

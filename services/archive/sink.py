@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 from typing import Protocol
 
@@ -29,6 +30,8 @@ class FileSink:
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self._fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o644)
+        # While this is open nobody repairs it; the kernel gives the lock back even after a kill -9.
+        fcntl.flock(self._fd, fcntl.LOCK_EX)
         self._since_drop = 0
 
     def write(self, *parts: Buffer) -> None:

@@ -95,4 +95,5 @@ def record_bytes(record: McapRecord) -> bytes:
     """A record as the library writes it."""
     builder = RecordBuilder()
     record.write(builder)
-    return builder.end()
+    encoded: bytes = builder.end()  # type: ignore[no-untyped-call]  # the library leaves it untyped
+    return encoded

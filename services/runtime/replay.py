@@ -1,0 +1,185 @@
+"""A log through the very steps of the services: no bus, clock or thread, so equal inputs give equal bits."""
+
+from __future__ import annotations
+
+import hashlib
+import tempfile
+from collections import Counter, deque
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from endo3d.schemas import codec, topics
+from endo3d.schemas.messages import Message
+from endo3d.schemas.topics import Topic
+from endo3d.services.archive.entry import CALIBRATION_FILE, STACK_FILE, Attachment, Entry
+from endo3d.services.archive.facts import host_facts
+from endo3d.services.archive.reader import Log, Record
+from endo3d.services.archive.recording import Recording
+from endo3d.services.archive.writer import Kind
+from endo3d.services.runtime import stack_file
+from endo3d.services.runtime.errors import UserError
+from endo3d.services.runtime.service import Service, Source, Tap
+from endo3d.services.runtime.stack_file import Stack
+
+CARRIED = frozenset({topics.MODE, topics.CAMERA, topics.PROJECTOR, topics.TRUTH})
+"""What a log of results takes over from the log they were made of."""
+
+
+class Result(NamedTuple):
+    """What a service made of an input."""
+
+    service: str
+    message: Message
+    cause: Record
+    """The record of the log that it followed from."""
+
+
+class Pipeline:
+    """Services wired by what they read and write, run in one thread."""
+
+    def __init__(self, services: Mapping[str, Service[Any]]) -> None:
+        self.services = services
+        self._readers: dict[Topic, list[str]] = {topic: [] for topic in topics.TOPICS}
+        for name, service in services.items():
+            for topic in service.reads:
+                self._readers[topic].append(name)
+        self.written = frozenset(topic for service in services.values() for topic in service.writes)
+        """What the services produce."""
+        self.inputs = frozenset(topic for topic, names in self._readers.items() if names) - self.written
+        """What a log has to give."""
+
+    def feed(self, message: Message) -> Iterator[tuple[str, Message]]:
+        """One message in; yields (service, message) of all that follows from it, in the order of making."""
+        waiting = deque([message])
+        while waiting:
+            now = waiting.popleft()
+            for name in self._readers[topics.of(now)]:
+                for made in self.services[name].step(now):
+                    yield name, made
+                    waiting.append(made)
+
+
+@contextmanager
+def stack_of(log: Log, stack: str | Path | None = None, overrides: Sequence[str] = ()) -> Iterator[Stack]:
+    """The stack that made a log (or another), with the log's calibration and ``table.key=value`` overrides.
+
+    Raises ``UserError`` when the log carries no stack file and none is given.
+    """
+    with tempfile.TemporaryDirectory(prefix="endo3d-") as folder:
+        calibration = log.attachments.get(CALIBRATION_FILE)
+        if calibration is not None:
+            head = Path(folder) / CALIBRATION_FILE
+            head.write_bytes(calibration)
+            overrides = (f"rig.head={head}", *overrides)
+        if stack is not None:
+            yield stack_file.load(stack, overrides)
+        elif text := log.attachments.get(STACK_FILE, b"").decode():
+            yield stack_file.loads(text, overrides)
+        else:
+            raise UserError(f"{log.path} carries no stack file; name one with --stack")
+
+
+@contextmanager
+def pipeline_of(stack: Stack, only: Collection[str] = ()) -> Iterator[Pipeline]:
+    """The services of a stack that compute (or ``only`` these), opened and warm.
+
+    Sources, taps and those that write nothing don't: the log takes the sources' place, nobody watches.
+    """
+    chosen = [
+        entry
+        for entry in stack.entries
+        if entry.name in only
+        or (not only and entry.kind.reads and entry.kind.writes and not issubclass(entry.kind, Source | Tap))
+    ]
+    if missing := set(only) - {entry.name for entry in chosen}:
+        raise UserError(f"the stack has no {', '.join(sorted(missing))}; it has {', '.join(stack.tables)}")
+    with ExitStack() as closing:
+        services = {}
+        for entry in chosen:
+            services[entry.name] = service = entry.build()
+            closing.callback(service.close)
+            service.open()
+            service.warm()
+        yield Pipeline(services)
+
+
+class Digest:
+    """One SHA-256 per topic over the encoded messages: equal replays have equal digests."""
+
+    def __init__(self) -> None:
+        self.counts: Counter[str] = Counter()
+        self._sums: dict[str, Any] = {}
+
+    def add(self, message: Message, encoded: bytes) -> None:
+        name = topics.of(message).name
+        self.counts[name] += 1
+        self._sums.setdefault(name, hashlib.sha256()).update(encoded)
+
+    def as_dict(self) -> dict[str, str]:
+        return {name: total.hexdigest() for name, total in sorted(self._sums.items())}
+
+
+def recording_of(path: Path, log: Log, stack: Stack) -> Recording:
+    """A new log for the results, with the stack as replayed and the calibration of the old log."""
+    attachments = [Attachment(STACK_FILE, "application/toml", stack.toml.encode())]
+    if (calibration := log.attachments.get(CALIBRATION_FILE)) is not None:
+        attachments.append(Attachment(CALIBRATION_FILE, "application/yaml", calibration))
+    return Recording(
+        path, {**host_facts(), "rig": stack.rig.name, "replayed_from": log.path.name}, attachments
+    )
+
+
+def replay(
+    log: Log,
+    pipeline: Pipeline,
+    *,
+    inputs: Collection[Topic] = (),
+    start_ns: int = 0,
+    end_ns: int = 1 << 63,
+    into: Recording | None = None,
+    digest: Digest | None = None,
+) -> Iterator[Result]:
+    """Feed a log's messages, in the order they arrived, and yield everything the services make of them.
+
+    ``inputs``: only these topics of the log; else all that the services read and don't produce themselves.
+    ``into`` gets the results and what is small of the inputs, at the inputs' times.
+    """
+    wanted = frozenset(inputs) or pipeline.inputs
+    kept = {topic for topic in CARRIED if topic not in pipeline.written} if into is not None else set()
+    for record in log.records(wanted | kept, start_ns=start_ns, end_ns=end_ns):
+        topic = record.stream.topic
+        if into is not None and topic in kept:
+            into.put(_entry(topic, "", record.sequence, record.log_ns, record.publish_ns, record.payload))
+        if topic not in wanted:
+            continue
+        for service, message in pipeline.feed(record.message()):
+            if into is not None or digest is not None:
+                _keep(Result(service, message, record), into, digest)
+            yield Result(service, message, record)
+
+
+def _keep(result: Result, into: Recording | None, digest: Digest | None) -> None:
+    message, cause = result.message, result.cause
+    encoded = codec.encode(message)
+    if digest is not None:
+        digest.add(message, encoded)
+    if into is not None:
+        sequence = getattr(message, "sequence", 0)
+        topic = topics.of(message)
+        into.put(_entry(topic, result.service, sequence, cause.log_ns, message.stamp_ns, memoryview(encoded)))
+
+
+def _entry(
+    topic: Topic, source: str, sequence: int, log_ns: int, stamp_ns: int, payload: memoryview
+) -> Entry:
+    return Entry(
+        channel=topic.channel(source),
+        kind=Kind(*codec.schema(topic)),
+        sequence=sequence,
+        log_ns=log_ns,
+        publish_ns=stamp_ns,
+        payload=(payload,),
+        latched=topic.latched,
+    )
