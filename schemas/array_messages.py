@@ -33,7 +33,7 @@ def _fill_image(proto: Any, image: NDArray[Any], encodings: dict[str, str]) -> N
     encoding = encodings.get(image.dtype.str)
     if encoding is None or image.ndim != 2 or image.size == 0:
         raise ValueError(
-            f"an image is (height, width) of {' or '.join(encodings)}, not {image.shape} {image.dtype}"
+            f"an image is (height, width) of {' or '.join(encodings.values())}, not {image.shape} {image.dtype}"
         )
     proto.height, proto.width = image.shape
     proto.encoding = encoding
