@@ -47,7 +47,9 @@ class Head:
             raise ValueError(f"the head's file is not YAML: {str(error).splitlines()[0]}") from error
         section = tree.get("head") if isinstance(tree, Mapping) else None
         if not isinstance(section, Mapping):
-            raise ValueError("the calibration has no 'head' section; take one from the head files in deploy/heads")
+            raise ValueError(
+                "the calibration has no 'head' section; take one from the head files in deploy/heads"
+            )
         flat: dict[str, Any] = dict(section)
         for key, value in dict(flat.pop("fibre", {})).items():
             flat[f"fibre_{key}"] = value

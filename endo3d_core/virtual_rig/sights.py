@@ -1,0 +1,108 @@
+"""A shape seen from one pose of the head: prepared once per pose, cast chunk by chunk."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from endo3d_core.virtual_rig import profile, sphere
+from endo3d_core.virtual_rig.profile import Profile, View
+from endo3d_core.virtual_rig.scene import Shape, Sphere
+
+BIAS_MM = np.float32(0.004)
+"""A surface point must lie this far behind another one to be in its shadow."""
+
+SLOPES = 8192
+"""Directions in which an extruded scene is tabulated: 2 um apart on the object."""
+
+
+@dataclass(slots=True, eq=False)
+class Chunk:
+    """Some rays of the camera, z = 1, and what they meet; all (n,) float32 but ``body``."""
+
+    rx: NDArray[np.float32]
+    ry: NDArray[np.float32]
+    z: NDArray[np.float32]
+    nx: NDArray[np.float32]
+    ny: NDArray[np.float32]
+    nz: NDArray[np.float32]
+    body: NDArray[np.uint8]
+    lit: NDArray[np.float32]
+
+
+class Sight(Protocol):
+    """One body from one pose."""
+
+    def cast(self, chunk: Chunk, index: np.uint8) -> None:
+        """Depth, normal and body where this one is nearer."""
+
+    def shadow(self, chunk: Chunk) -> None:
+        """Clear ``lit`` where this one stands in the projector's light."""
+
+
+@dataclass(frozen=True, eq=False)
+class Field:
+    """The outlines of what camera and projector can see, as rays with z = 1: (n, 3)."""
+
+    camera: NDArray[np.float64]
+    projector: NDArray[np.float64]
+    """In the camera's axes."""
+    projector_centre_mm: NDArray[np.float64]
+
+
+def sight(shape: Shape, T_body_camera: NDArray[np.float64], field: Field) -> Sight:
+    """Prepare a shape for one pose."""
+    match shape:
+        case Profile():
+            return ProfileSight(shape, T_body_camera, field)
+        case Sphere():
+            return SphereSight(shape, T_body_camera, field)
+
+
+class ProfileSight:
+    def __init__(self, shape: Profile, T: NDArray[np.float64], field: Field) -> None:
+        self.T = T.astype(np.float32)
+        lamp = T[:3, :3] @ field.projector_centre_mm + T[:3, 3]
+        self.lamp_x, self.lamp_z = np.float32(lamp[0]), np.float32(lamp[2])
+        self.camera = self._view(shape, T[:3, 3], field.camera @ T[:3, :3].T)
+        self.projector = self._view(shape, lamp, field.projector @ T[:3, :3].T)
+
+    @staticmethod
+    def _view(shape: Profile, origin: NDArray[np.float64], rays: NDArray[np.float64]) -> View:
+        slopes = rays[:, 0] / rays[:, 2]
+        low, high = float(slopes.min()), float(slopes.max())
+        margin = 0.02 * (high - low)
+        return profile.seen_from(shape, origin[0], origin[2], (low - margin, high + margin), SLOPES)
+
+    def cast(self, chunk: Chunk, index: np.uint8) -> None:
+        view, c = self.camera, chunk
+        first, per_unit = np.float32(view.first_slope), np.float32(view.slopes_per_unit)
+        profile.cast(
+            self.T, first, per_unit, view.advance, view.nx, view.nz,
+            c.rx, c.ry, c.z, c.nx, c.ny, c.nz, c.body, index,
+        )  # fmt: skip
+
+    def shadow(self, chunk: Chunk) -> None:
+        view, c = self.projector, chunk
+        first, per_unit = np.float32(view.first_slope), np.float32(view.slopes_per_unit)
+        profile.shadow(
+            self.T, self.lamp_x, self.lamp_z, first, per_unit, view.advance, BIAS_MM, c.rx, c.ry, c.z, c.lit
+        )
+
+
+class SphereSight:
+    def __init__(self, shape: Sphere, T: NDArray[np.float64], field: Field) -> None:
+        self.centre = (-T[:3, :3].T @ T[:3, 3]).astype(np.float32)
+        self.radius = np.float32(shape.radius_mm)
+        self.lamp = field.projector_centre_mm.astype(np.float32)
+
+    def cast(self, chunk: Chunk, index: np.uint8) -> None:
+        c = chunk
+        sphere.cast(*self.centre, self.radius, c.rx, c.ry, c.z, c.nx, c.ny, c.nz, c.body, index)
+
+    def shadow(self, chunk: Chunk) -> None:
+        c = chunk
+        sphere.shadow(*self.centre, self.radius, *self.lamp, BIAS_MM, c.rx, c.ry, c.z, c.lit)

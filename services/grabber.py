@@ -1,0 +1,125 @@
+"""Camera to frames: every shot gets its sequence number, slot and pattern set, and travels in place."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator, Mapping
+from typing import ClassVar
+
+from pydantic import Field
+
+from endo3d.schemas import topics
+from endo3d.schemas.messages import CameraCalibration, Frame, Message, Mode, ProjectorCalibration, Truth
+from endo3d.services.devices.camera import Camera, Shot, Simulated, open_camera
+from endo3d.services.devices.labels import Label, Labels
+from endo3d.services.devices.uri import DeviceError, Setting
+from endo3d.services.runtime import service
+from endo3d.services.runtime.errors import UserError
+from endo3d.services.runtime.service import Exhausted, Source
+from endo3d_core.calibration import Rig
+
+TURN_S = 0.004
+HELD = 2
+"""Shots that wait for their mode to be announced."""
+
+
+class Config(service.Config):
+    camera: str = "sim:"
+    """The device's URI."""
+    rig: str = "demo"
+    head: str = ""
+    """The calibration: path of the sensor head's YAML."""
+    lend_ahead: int = Field(2, ge=1, le=16)
+    """Frames of shared memory that the camera holds in advance."""
+
+
+class Grabber(Source[Config]):
+    Config = Config
+    reads = (topics.MODE,)
+    writes = (topics.FRAME, topics.CAMERA, topics.PROJECTOR, topics.TRUTH)
+    optional: ClassVar = (topics.MODE,)
+
+    def open(self) -> None:
+        try:
+            self.yaml = open(self.config.head, encoding="utf-8").read()
+            self.camera: Camera = open_camera(self.config.camera, Setting(self.config.rig, self.yaml))
+        except OSError as error:
+            raise UserError(
+                f"head {self.config.head!r}: {error.strerror}; name a file of deploy/heads"
+            ) from error
+        except (DeviceError, ValueError) as error:
+            raise UserError(str(error)) from error
+        self.labels = Labels()
+        self.lent = 0
+        self.held: deque[Shot] = deque()
+        self.announced = False
+        self.camera.arm()
+
+    def step(self, message: Message) -> Iterator[Message]:
+        if isinstance(message, Mode):
+            self.labels.add(message)
+            if message.running:
+                self.camera.set_exposure(message.exposure_us)
+        yield from ()
+
+    def poll(self, timeout_s: float) -> Iterator[Message]:
+        if not self.announced:
+            self.announced = True
+            yield from self.calibration()
+        self.lend()
+        # In short turns: a mode that is announced meanwhile has to be known before its first shot is labelled.
+        shot = self.camera.wait(min(timeout_s, TURN_S))
+        if shot is not None:
+            self.lent -= 1
+            self.held.append(shot)
+        while self.held and (label := self.labels.of(self.held[0].trigger_ns)) is not None:
+            yield from self.labelled(self.held.popleft(), label)
+        if len(self.held) > HELD:
+            self.held.popleft()
+            self.labels.losses["shot:unlabelled"] += 1
+
+    def lend(self) -> None:
+        """Keep the camera supplied; when the readers hold everything, the camera counts what it loses."""
+        while self.lent < self.config.lend_ahead:
+            try:
+                image = self.loan(topics.FRAME, self.camera.shape, self.camera.dtype)
+            except Exhausted:
+                return
+            self.camera.lend(image)
+            self.lent += 1
+
+    def labelled(self, shot: Shot, label: Label) -> Iterator[Message]:
+        """The frame, and its truth when the camera knows it."""
+        stamp_ns = shot.trigger_ns + round(shot.exposure_us * 500)
+        yield Frame(
+            stamp_ns, label.sequence, shot.image, label.pattern_set, label.slot, label.epoch,
+            shot.exposure_us, shot.trigger_ns, shot.frame_id,
+        )  # fmt: skip
+        if isinstance(self.camera, Simulated):
+            camera = self.camera
+            yield Truth(
+                stamp_ns, label.sequence, camera.T_scene_camera(stamp_ns), camera.scene, camera.slow_motion
+            )
+
+    def calibration(self) -> Iterator[Message]:
+        """What the frames were taken with; the camera's lens as it is binned."""
+        rig, now_ns = Rig.from_yaml(self.yaml), self.camera.now_ns()
+        bin_px = max(1, round(rig.camera.width / self.camera.shape[1]))
+        lens, projector = rig.camera.binned(bin_px), rig.projector
+        yield CameraCalibration(now_ns, lens.width, lens.height, lens.K, lens.dist)
+        yield ProjectorCalibration(
+            now_ns,
+            projector.width,
+            projector.height,
+            projector.K,
+            projector.dist,
+            rig.T_projector_camera,
+            self.yaml,
+        )
+
+    def losses(self) -> Mapping[str, int]:
+        return {**self.labels.losses, **{f"camera:{cause}": n for cause, n in self.camera.losses().items()}}
+
+    def close(self) -> None:
+        if hasattr(self, "camera"):
+            self.camera.close()
