@@ -23,7 +23,7 @@ from zenoh.handlers import FifoChannel
 from endo3d.schemas import codec, topics
 from endo3d.schemas.messages import LogLine, Message, Status
 from endo3d.schemas.topics import Topic
-from endo3d.services.runtime import pool
+from endo3d.services.runtime import mapping, pool, segments
 from endo3d.services.runtime.errors import UserError
 from endo3d.services.runtime.memory import Memory
 from endo3d.services.runtime.reader import Reader
@@ -37,6 +37,9 @@ log = logging.getLogger(__name__)
 
 _ASK_AGAIN_S: Final = 0.02
 
+_open_buses: set[Bus] = set()
+"""Of this process: the last one to close tidies up the shared memory."""
+
 Command = Callable[[str, Mapping[str, Any]], Mapping[str, Any]]
 """(verb, parameters) -> reply; raises ``Refused``."""
 
@@ -45,7 +48,7 @@ class Bus:
     """One process's place on the bus of a rig. Make it with ``Bus.open``; it is a context manager."""
 
     def __init__(
-        self, rig: str, name: str, session: zenoh.Session, memory: Memory | None, view: View | None, note: str
+        self, rig: str, name: str, session: zenoh.Session, shared_memory: bool, view: View | None, note: str
     ) -> None:
         self.rig = rig
         self.name = name
@@ -53,14 +56,16 @@ class Bus:
         """Why this process is slower than it could be; empty when it isn't."""
         self.tally = Tally()
         self._session = session
-        self._memory = memory
+        self._memory = Memory(view, self._offer_pool) if shared_memory else None
         self._view = view
         self._writers: dict[str, Writer] = {}
         self._readers: list[Reader] = []
         self._queryables: list[zenoh.Queryable[Any]] = []
+        self._mappings: list[zenoh.Subscriber[None] | zenoh.Queryable[None]] = []
         self._tokens: list[zenoh.LivelinessToken] = []
         self._named: set[str] = set()
         self._lock = threading.Lock()
+        _open_buses.add(self)
 
     @classmethod
     def open(
@@ -80,10 +85,11 @@ class Bus:
         settings: zenoh configuration over the built-in one, path -> value.
         Raises ``UserError`` with what to do.
         """
-        note, view, memory = "", None, None
+        note, view = "", None
         if not shared_memory:
             note = "shared memory is switched off: large messages go over the loopback network"
         elif not lockable(shm_mb << 20):
+            shared_memory = False
             note = (
                 f"may not lock {shm_mb} MB of memory: large messages go over the loopback network; "
                 "raise the limit (ulimit -l unlimited, LimitMEMLOCK=infinity, --ulimit memlock=-1)"
@@ -92,17 +98,17 @@ class Bus:
             try:
                 view = pool.self_test()
             except zenoh.ZError as error:
+                shared_memory = False
                 note = f"no shared memory ({error}): large messages go over the network; see endo3d doctor"
             else:
-                memory = Memory(view)
                 if view is None:
                     note = f"no zero-copy view in zenoh {version('eclipse-zenoh')}: large messages are copied"
         if note:
             log.warning(note)
         session = open_session(
-            meeting_port(rig) if port is None else port, shared_memory=memory is not None, settings=settings
+            meeting_port(rig) if port is None else port, shared_memory=shared_memory, settings=settings
         )
-        return cls(rig, name, session, memory, view, note)
+        return cls(rig, name, session, shared_memory, view, note)
 
     def __enter__(self) -> Self:
         return self
@@ -123,9 +129,13 @@ class Bus:
         self._tokens, self._queryables, self._readers = [], [], []
 
     def close(self) -> None:
-        """Stop reading, then leave."""
+        """Stop reading, then leave. Arrays that were loaned or received are void from now on."""
         self.stop_reading()
         self._session.close()
+        self._memory = None
+        _open_buses.discard(self)
+        if not _open_buses:
+            segments.unlink_unused()
 
     # ---------------------------------------------------------------- messages
 
@@ -173,6 +183,8 @@ class Bus:
         self, topic: Topic, handler: Callable[[Sample], None], *, depth: int | None = None
     ) -> None:
         """The same with samples as they travelled."""
+        if topic.bulk and self._view is not None:
+            self._mappings.append(mapping.map_offered(self._session, mapping.key(self.rig, topic)))
         reader = Reader(
             self._session, topic.key(self.rig), topic, handler, self._view, self.tally, depth or topic.depth
         )
@@ -244,6 +256,9 @@ class Bus:
             if key not in self._writers:
                 self._writers[key] = Writer(self._session, topic, key)
             return self._writers[key]
+
+    def _offer_pool(self, topic: Topic, piece: zenoh.ZBytes) -> None:
+        self._mappings.append(mapping.offer(self._session, mapping.key(self.rig, topic), piece))
 
     def _decoded(self, sample: Sample) -> Message | None:
         try:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import threading
+from collections.abc import Callable
 from typing import Any, Final
 
 import numpy as np
@@ -21,14 +22,20 @@ _SMALL_BYTES: Final = 3_072
 """Below this a message travels in the descriptor's place, which is cheaper than a chunk."""
 _COMMON_CHUNK_BYTES: Final = 1 << 20
 """Of the pool for everything that is neither small nor bulk: map deltas, calibrations."""
+_PIECE_BYTES: Final = 64
+"""Of every new pool, offered to readers to map it by."""
 
 
 class Memory:
     """Lends arrays in shared memory and makes payloads of messages. Bulk topics have a pool each."""
 
-    def __init__(self, view: View | None) -> None:
-        """``view`` None: no zero-copy view, chunks are filled through zenoh's copying API."""
+    def __init__(self, view: View | None, offer: Callable[[Topic, ZBytes], None]) -> None:
+        """``view`` None: no zero-copy view, chunks are filled through zenoh's copying API.
+
+        ``offer`` is given a piece of every pool of a bulk topic as soon as it exists.
+        """
         self._view = view
+        self._offer = offer
         self._pools: dict[Topic | None, Pool] = {}
         self._lock = threading.Lock()
 
@@ -68,6 +75,8 @@ class Memory:
             pool = self._pools.get(key)
             if pool is None or (topic.bulk and size > pool.chunk_bytes):
                 pool = self._pools[key] = Pool(size if topic.bulk else _COMMON_CHUNK_BYTES, self._view)
+                if topic.bulk:
+                    self._offer(topic, seal(pool.take(_PIECE_BYTES)))
             return pool
 
 
