@@ -1,0 +1,110 @@
+"""``endo3d view``: a log in Rerun, or a picture of it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from endo3d.services.runtime.errors import UserError
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from endo3d.services.archive.reader import Log
+    from endo3d.services.views.scan import Scan
+
+COLOURS = ("height", "quality", "deviation")
+
+
+def view(
+    log: Annotated[Path, typer.Argument(metavar="LOG", help="A log, LOG.mcap.")],
+    picture: Annotated[
+        Path | None, typer.Option("--picture", metavar="PNG", help="Write a picture; needs no screen.")
+    ] = None,
+    rrd: Annotated[
+        Path | None, typer.Option("--rrd", metavar="RRD", help="Write a Rerun recording, and open nothing.")
+    ] = None,
+    colour: Annotated[
+        str, typer.Option("--colour", help="height, quality or deviation from the truth.")
+    ] = "height",
+    web: Annotated[
+        bool, typer.Option("--web", help="A page for browsers on this machine, not a window.")
+    ] = False,
+    by_rerun: Annotated[
+        bool, typer.Option("--rerun", help="With --picture: as Rerun shows it, not as endo3d draws it.")
+    ] = False,
+) -> None:
+    """Show a log in Rerun: merged cloud, way of the tip, frustum, image, depth map, plots.
+
+    Examples: endo3d view scan.mcap; endo3d view scan.mcap --picture scan.png --colour deviation
+    """
+    from endo3d.services.archive.reader import Log
+
+    if colour not in COLOURS:
+        raise UserError(f"no colouring {colour!r}; choose {', '.join(COLOURS)}")
+    opened = Log(log)
+    if picture is not None:
+        _draw(opened, picture, colour, by_rerun)
+    if rrd is not None:
+        _write(opened, rrd, colour)
+    if picture is None and rrd is None:
+        _open(opened, colour, web)
+
+
+def _draw(log: Log, path: Path, colour: str, by_rerun: bool) -> None:
+    from endo3d.services.views.picture import picture
+    from endo3d.services.views.scan import Scan
+
+    if by_rerun:
+        from endo3d.services.views.headless import rerun_picture
+
+        with TemporaryDirectory() as folder:
+            recording = Path(folder) / "log.rrd"
+            _write(log, recording, colour)
+            rerun_picture(recording, path)
+        return
+    scan = Scan.of(log.messages())
+    picture(scan, path, colour=colour, deviation_um=_deviation(scan) if colour == "deviation" else None)
+
+
+def _deviation(scan: Scan) -> NDArray[np.float64]:
+    from endo3d.services.cli.truth import compare
+
+    comparison = compare(scan.poses, scan.truths, scan.points())
+    if comparison is None:
+        raise UserError("deviation needs a simulated log with tracked poses; choose --colour height")
+    return comparison.deviation_um
+
+
+def _write(log: Log, path: Path, colour: str) -> None:
+    from endo3d.services.views.recording import write_rrd
+
+    write_rrd(log.messages(), path, colour=colour)
+
+
+def _open(log: Log, colour: str, web: bool) -> None:
+    """Fill a viewer with the log, and stay until it is closed."""
+    from endo3d.services.views.blueprint import scan_blueprint
+    from endo3d.services.views.display import Display
+    from endo3d.services.views.recording import MAP_HZ, RATE_HZ, play
+    from endo3d.services.views.sink import ViewerSink
+    from endo3d.services.views.viewer_process import ViewerProcess, has_display
+
+    if not web and not has_display():
+        raise UserError("no display here: endo3d view LOG --web, --picture PNG or --rrd RRD")
+    viewer = ViewerProcess(web_port=0 if web else None)
+    try:
+        if web:
+            print(f"open {viewer.page} (Ctrl-C ends it)")
+        sink = ViewerSink(viewer.url, scan_blueprint(), patience_s=60.0)
+        play(log.messages(), sink, Display(RATE_HZ, MAP_HZ, colour))
+        sink.close()
+        viewer.wait()
+    except KeyboardInterrupt:
+        pass
+    finally:
+        viewer.stop()

@@ -1,0 +1,1 @@
+"""What leaves the house: clouds, surfaces, depth maps, trajectories and bags in other programs' formats."""
