@@ -32,9 +32,8 @@ def _size(value: float, what: str) -> float:
 def _fill_image(proto: Any, image: NDArray[Any], encodings: dict[str, str]) -> None:
     encoding = encodings.get(image.dtype.str)
     if encoding is None or image.ndim != 2 or image.size == 0:
-        raise ValueError(
-            f"an image is (height, width) of {' or '.join(encodings.values())}, not {image.shape} {image.dtype}"
-        )
+        known = " or ".join(encodings.values())
+        raise ValueError(f"an image is (height, width) of {known}, not {image.shape} {image.dtype}")
     proto.height, proto.width = image.shape
     proto.encoding = encoding
     proto.step = image.shape[1] * image.itemsize

@@ -6,11 +6,12 @@ import dataclasses
 from collections.abc import Mapping
 
 import numpy as np
-from endo3d.schemas import messages as m
-from endo3d.schemas import topics
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scipy.spatial.transform import Rotation
+
+from endo3d.schemas import messages as m
+from endo3d.schemas import topics
 
 MAP_POINT = np.dtype(
     [(name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz", "intensity", "sigma")]

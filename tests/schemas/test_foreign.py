@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from any_message import MESSAGES, example
-from endo3d.schemas import codec, endo3d_pb2, messages, topics
 from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
 from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
 from foxglove_schemas_protobuf.Log_pb2 import Log
@@ -15,6 +14,8 @@ from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from hypothesis import given
 from scipy.spatial.transform import Rotation
+
+from endo3d.schemas import codec, endo3d_pb2, messages, topics
 
 STOCK = {
     topics.FRAME: RawImage,

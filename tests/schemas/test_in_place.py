@@ -10,6 +10,7 @@ import weakref
 import numpy as np
 import pytest
 from any_message import example
+
 from endo3d.schemas import codec, topics
 from endo3d.schemas.messages import POINT
 

@@ -7,9 +7,10 @@ import dataclasses
 import numpy as np
 import pytest
 from any_message import MESSAGES, assert_equal, example
-from endo3d.schemas import codec, topics
 from hypothesis import given
 from hypothesis import strategies as st
+
+from endo3d.schemas import codec, topics
 
 every_topic = pytest.mark.parametrize("topic", topics.TOPICS, ids=lambda topic: topic.name)
 any_message = st.sampled_from(topics.TOPICS).flatmap(lambda topic: MESSAGES[topic])

@@ -5,11 +5,12 @@ from __future__ import annotations
 import time
 
 import pytest
-from endo3d.schemas import wire
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from google.protobuf.internal import decoder, encoder
 from hypothesis import given
 from hypothesis import strategies as st
+
+from endo3d.schemas import wire
 
 DATA = 6
 numbers = st.integers(0, 2**64 - 1)
