@@ -180,9 +180,7 @@ def zero_copy() -> Finding:
             "zero copy", Level.WARN, str(error), "messages go over the loopback network; see locked memory"
         )
     if view is None:
-        return Finding(
-            "zero copy", Level.WARN, f"no view in zenoh {version}", "install the zenoh tested"
-        )
+        return Finding("zero copy", Level.WARN, f"no view in zenoh {version}", "install the zenoh tested")
     return Finding("zero copy", Level.OK, f"zenoh {version}, views verified")
 
 

@@ -25,8 +25,18 @@ def run(
 
     follow_parent()
 
+    import logging
+
     from endo3d.services.runtime import runner, stack_file
+    from endo3d.services.runtime.errors import UserError
 
     described = stack_file.load(stack, overrides or ())
     built = described.entry(service).build()
-    raise typer.Exit(runner.run(built, rig=described.rig.name, name=service, port=described.rig.port))
+    try:
+        code = runner.run(built, rig=described.rig.name, name=service, port=described.rig.port)
+    except UserError:
+        raise
+    except Exception:
+        logging.getLogger(service).exception("ends: this should not have happened")
+        code = 1
+    raise typer.Exit(code)

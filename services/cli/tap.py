@@ -122,7 +122,7 @@ def saved(message: Message, folder: Path) -> list[Path]:
     import cv2
 
     from endo3d.schemas.messages import Cloud, DepthMap, Frame, MapDelta
-    from endo3d.services.exchange import ply
+    from endo3d.services.exchange.ply import write_ply
 
     match message:
         case Frame(image=image):
@@ -133,10 +133,10 @@ def saved(message: Message, folder: Path) -> list[Path]:
             cv2.imwrite(str(path), depth)
         case Cloud(points=points):
             path = folder / f"cloud_{message.sequence:08d}.ply"
-            ply.write(path, points)
+            write_ply(points, path)
         case MapDelta(points=points):
             path = folder / f"map_{message.revision:08d}.ply"
-            ply.write(path, points)
+            write_ply(points, path)
         case _:
             return []
     return [path]

@@ -67,8 +67,11 @@ class Entry:
         return issubclass(self.kind, Source)
 
     def build(self) -> Service[Any]:
-        """The service itself; nothing is opened yet."""
-        return self.kind(self.config)
+        """The service itself; nothing is opened yet. Raises ``UserError``."""
+        try:
+            return self.kind(self.config)
+        except ValueError as error:
+            raise UserError(f"[{self.name}] {error}") from None
 
 
 @dataclass(frozen=True)

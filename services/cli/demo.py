@@ -1,0 +1,158 @@
+"""``endo3d demo``: the whole stack on the virtual rig, and what came of it."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from endo3d.services.cli.options import JsonOption, SetOption
+
+if TYPE_CHECKING:
+    from rich.progress import Progress
+
+    from endo3d.services.cli.up import Asked
+    from endo3d.services.cli.watch import Watch
+    from endo3d.services.runtime.launcher import Launcher
+    from endo3d.services.runtime.stack_file import Stack
+
+START_LIMIT_S = 180.0
+"""Compiling every kernel for the first time takes a while."""
+
+
+def demo(
+    seconds: Annotated[float, typer.Option("--seconds", min=1.0, help="How long to scan.")] = 30.0,
+    out: Annotated[
+        Path | None, typer.Option("--out", help="Folder for the files; default out/demo-<time>.")
+    ] = None,
+    stack: Annotated[str, typer.Option("--stack", help="Another stack than the stock one.")] = "demo",
+    overrides: SetOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Scan the micro-contour standard on the virtual rig, and compare with the truth.
+
+    Starts every service as a process of its own: projector sequence, camera, decoder, odometry, recorder,
+    viewer. A hand-guided scan is rendered live, in slow motion. At the end: a table, a log, the merged cloud,
+    a Rerun recording and a picture.
+
+    Examples: endo3d demo; endo3d demo --seconds 60 --out scan; endo3d demo --json
+    """
+    from endo3d.services.cli.demo_report import show, write
+
+    folder = out or Path("out") / f"demo-{datetime.now(UTC):%Y%m%d-%H%M%S}"
+    folder.mkdir(parents=True, exist_ok=True)
+    figures = scan(stack, [*(overrides or ()), *_recording(folder)], seconds, quiet=as_json)
+    report = write(folder, figures)
+    if as_json:
+        print(json.dumps(report, indent=2))
+    else:
+        show(report)
+
+
+def _recording(folder: Path) -> list[str]:
+    return [f"recorder.directory={folder.resolve()}", "recorder.name=scan", "recorder.autostart=true"]
+
+
+def scan(stack: str, overrides: list[str], seconds: float, quiet: bool) -> dict[str, Any]:
+    """Run the stack for ``seconds`` from its first cloud on; what was measured while it ran."""
+    from endo3d.services.cli.up import Asked
+    from endo3d.services.cli.watch import Watch, percentiles_ms
+    from endo3d.services.runtime import graph, stack_file
+    from endo3d.services.runtime.bus import Bus
+    from endo3d.services.runtime.errors import UserError
+    from endo3d.services.runtime.launcher import Launcher, children_of
+
+    began_s = time.monotonic()
+    described = stack_file.load(stack, overrides)
+    graph.of(described)
+    asked, lines = Asked(), Lines()
+    with Bus.open(described.rig.name, name="demo", port=described.rig.port) as bus:
+        if there := bus.alive():
+            names = ", ".join(sorted(there))
+            raise UserError(f"rig {bus.rig} runs already ({names}); end it, or --set rig.name=another")
+        watch = Watch(bus)
+        with Launcher(children_of(described, overrides), lines) as launcher, _progress(quiet) as progress:
+            lines.progress = progress
+            launcher.start()
+            _await_first_cloud(launcher, watch, asked, described, progress, began_s)
+            scanned_s = _scan(launcher, watch, asked, described, progress, seconds)
+            progress.update(progress.add_task("closing the archive", total=None))
+            launcher.stop(hurry=lambda: asked.times > 1)
+        if launcher.user_error:
+            raise UserError(launcher.user_error)
+        return {
+            "rig": bus.rig,
+            "stack": described.label,
+            "start_s": watch.first_cloud_s - began_s,
+            "scan_s": scanned_s,
+            "latency_cloud_ms": percentiles_ms(watch.cloud_latency_ms),
+            "latency_pose_ms": percentiles_ms(watch.pose_latency_ms),
+            "lost": watch.lost(),
+            "restarts": {
+                child.name: child.total_restarts for child in launcher.children if child.total_restarts
+            },
+            "exit_code": launcher.exit_code,
+        }
+
+
+class Lines:
+    """Shows what the services say above the progress bar: what matters, unless somebody wants all of it."""
+
+    def __init__(self) -> None:
+        self.progress: Progress | None = None
+
+    def __call__(self, service: str, line: str) -> None:
+        from rich.text import Text
+
+        if self.progress is not None and not line.startswith("DEBUG") and line != "INFO ready":
+            self.progress.console.print(Text.assemble((f"{service:<10} │ ", "cyan"), line), soft_wrap=True)
+
+
+@contextmanager
+def _progress(quiet: bool) -> Iterator[Progress]:
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+    columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(24), TimeElapsedColumn())
+    with Progress(*columns, console=Console(stderr=True), disable=quiet, transient=True) as progress:
+        yield progress
+
+
+def _await_first_cloud(
+    launcher: Launcher, watch: Watch, asked: Asked, stack: Stack, progress: Progress, began_s: float
+) -> None:
+    from endo3d.services.runtime.errors import UserError
+    from endo3d.services.runtime.launcher import State
+
+    task = progress.add_task("starting", total=len(stack.tables))
+    names = list(stack.tables)
+    while not watch.clouds and not (launcher.done or asked.times):
+        launcher.turn(0.05)
+        missing = watch.starting(names)
+        what = f"starting {', '.join(missing)}" if missing else "waiting for the first cloud"
+        progress.update(task, completed=len(names) - len(missing), description=what)
+        if fallen := [child.name for child in launcher.children if child.state is State.GIVEN_UP]:
+            raise UserError(f"{', '.join(fallen)} keeps crashing; its lines above say why")
+        if time.monotonic() - began_s > START_LIMIT_S:
+            raise UserError(f"no cloud after {START_LIMIT_S:.0f} s; endo3d doctor checks this machine")
+    progress.remove_task(task)
+
+
+def _scan(
+    launcher: Launcher, watch: Watch, asked: Asked, stack: Stack, progress: Progress, seconds: float
+) -> float:
+    """Until the time is over, somebody asks, or the stack is done; seconds scanned."""
+    task = progress.add_task("scanning", total=seconds)
+    began_s = time.monotonic()
+    while (spent_s := time.monotonic() - began_s) < seconds and not (launcher.done or asked.times):
+        launcher.turn(0.1)
+        what = f"scanning: {watch.clouds} clouds at {watch.rate_hz('decoder'):.0f} Hz, {watch.tracking}"
+        progress.update(task, completed=spent_s, description=what)
+    progress.remove_task(task)
+    return spent_s
