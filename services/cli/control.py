@@ -9,15 +9,22 @@ if TYPE_CHECKING:
     from endo3d.services.runtime.bus import Bus
 
 
+def where(rig: str) -> tuple[str, int | None]:
+    """A rig's name and meeting port, given its name or its stack file."""
+    from endo3d.services.runtime.stack_file import load
+
+    if not rig.endswith(".toml"):
+        return rig, None
+    table = load(rig).rig
+    return table.name, table.port
+
+
 def join(rig: str) -> Bus:
     """The bus of a rig, given its name or its stack file."""
     from endo3d.services.runtime.bus import Bus
-    from endo3d.services.runtime.stack_file import load
 
-    if rig.endswith(".toml"):
-        table = load(rig).rig
-        return Bus.open(table.name, name="cli", port=table.port)
-    return Bus.open(rig, name="cli")
+    name, port = where(rig)
+    return Bus.open(name, name="cli", port=port)
 
 
 def command(rig: str, service: str, verb: str, parameters: Mapping[str, Any]) -> dict[str, Any]:

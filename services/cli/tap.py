@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import queue
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -45,34 +44,23 @@ def tap(
 
     Examples: endo3d tap pose; endo3d tap cloud --save clouds -n 1; endo3d tap status --json | jq .rate_hz
     """
-    from endo3d.services.cli.control import join
+    from endo3d.services import tap as reader
+    from endo3d.services.cli.control import where
     from endo3d.services.runtime.errors import UserError
 
     rig, topic = _topic(key, rig)
-    latest: queue.Queue[tuple[str, list[Path]]] = queue.Queue(maxsize=8)
+    name, port = where(rig)
     if save:
         save.mkdir(parents=True, exist_ok=True)
-
-    def take(message: Message) -> None:
-        """In the reader's thread, where the message's memory is valid."""
+    shown = 0
+    for message in reader.tap(topic, rig=name, port=port, timeout_s=timeout_s):
         line = json.dumps(plain(message)) if as_json else one_line(message)
         files = saved(message, save) if save else []
-        latest.put((line, files))
-
-    with join(rig) as bus:
-        bus.subscribe(topic, take, depth=1)
-        shown = 0
-        while not count or shown < count:
-            try:
-                line, files = latest.get(timeout=timeout_s)
-            except queue.Empty:
-                raise UserError(
-                    f"nothing on {topic.key(bus.rig)} for {timeout_s:g} s; endo3d top shows who is there"
-                ) from None
-            except KeyboardInterrupt:
-                return
-            print(line, *(f"-> {path}" for path in files), flush=True)
-            shown += 1
+        print(line, *(f"-> {path}" for path in files), flush=True)
+        shown += 1
+        if shown == count:
+            return
+    raise UserError(f"nothing on {topic.key(name)} for {timeout_s:g} s; endo3d top shows who is there")
 
 
 def _topic(key: str, rig: str) -> tuple[str, Topic]:
