@@ -40,6 +40,7 @@ class Frame:
     trigger_ns: int
     """The camera's own time of the exposure's start, rig clock."""
     camera_frame_id: int
+    """The camera's own count."""
     frame_id: str = "camera"
 
 
@@ -58,10 +59,13 @@ class Cloud:
     newest_stamp_ns: int
     """Mid-exposure of the window's newest frame: what latency is counted from."""
     epoch: int
+    """The frames'."""
     pattern_set: str
+    """The frames'."""
     grid_px: float
     """Camera pixels per grid step."""
     valid_count: int
+    """Points with a measured position."""
     slot_slips: int = 0
     """Slot slips detected and repaired since the epoch began."""
     frame_id: str = "camera"
