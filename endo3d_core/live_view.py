@@ -1,0 +1,103 @@
+"""A cloud made ready for registration and merging: pooled, gated, with normals, texture and scales of its own."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from endo3d_core import normals, pooling
+from endo3d_core.grid_rays import GridRays, fit_grid_rays
+
+POOL = 2
+STEEPEST = 2.5
+"""Slope up to which neighbouring cells count as one surface (68 deg)."""
+TEXTURE_BOX = 1.0 / 10.0
+"""Width of the texture's high-pass, in widths of the grid."""
+_REFIT_GROWTH = 1.3
+"""The rays are learnt again when a cloud has this many times more valid points than the one they came from."""
+
+
+class LiveView:
+    """Holds the arrays of one cloud at a time; nothing is allocated after the first."""
+
+    def __init__(self) -> None:
+        self.rays: GridRays | None = None
+        self.count = 0
+        """Valid pooled cells."""
+        self.live = np.empty((0, 0, normals.LIVE), np.float32)
+        """(rows, columns, LIVE) float32, see ``normals``."""
+        self.coefficients = np.zeros((2, 5), np.float32)
+        """The pooled grid's rays."""
+        self.sigma_mm = np.nan
+        """Typical 1-sigma of a pooled point along its ray."""
+        self.depth_mm = np.nan
+        """Typical z."""
+        self.pitch_mm = np.nan
+        """Typical distance of neighbouring pooled points."""
+
+        self.texture_sigma = np.nan
+        """1-sigma of the pooled texture's noise."""
+
+    def load(self, channels: NDArray[np.float32]) -> int:
+        """(height, width, 6) float32 x y z intensity quality sigma -> the number of valid pooled cells.
+
+        Raises ValueError when the cloud is not organised by rays, or too empty to tell.
+        """
+        self._learn_rays(channels)
+        assert self.rays is not None
+        pitch_mm = self._centre_depth(channels) / self.rays.focal_cells
+        self.count = pooling.pool(channels, STEEPEST * pitch_mm, self._planes)
+        if self.count == 0:
+            return 0
+        half = max(round(TEXTURE_BOX * self.live.shape[1] / 2), 2)
+        pooling.high_pass(self._planes, half, self._work)
+        self.pitch_mm = POOL * pitch_mm
+        normals.slopes(self._planes[pooling.Z], 2 * STEEPEST * self.pitch_mm, self._slopes)
+        normals.gather(self._planes, self._slopes, self.coefficients, self.live)
+        self.sigma_mm = float(np.nanmedian(self._planes[pooling.SIGMA, ::5, ::5]))
+        self.texture_sigma = grey_noise(channels[..., 3]) / POOL
+        self.depth_mm = float(np.nanmedian(self._planes[pooling.Z, ::5, ::5]))
+        return self.count
+
+    def normal_sigma(self) -> float:
+        """1-sigma (rad) of a normal's tilt from this one cloud."""
+        return float(np.sqrt(normals.SLOPE_VARIANCE)) * self.sigma_mm / self.pitch_mm
+
+    def _learn_rays(self, channels: NDArray[np.float32]) -> None:
+        shape = channels.shape[:2]
+        if self.rays is not None and self.rays.shape == shape:
+            valid = int(np.isfinite(channels[::3, ::3, 2]).sum())
+            if valid <= _REFIT_GROWTH * self.rays.fitted_cells:
+                return
+        self.rays = fit_grid_rays(channels)
+        self.coefficients = (self.rays.coefficients / POOL).astype(np.float32)
+        self.coefficients[:, 0] -= np.float32(0.5 * (POOL - 1) / POOL)
+        rows, columns = shape[0] // POOL, shape[1] // POOL
+        self._planes = np.empty((pooling.PLANES, rows, columns), np.float32)
+        self._slopes = np.empty((2, rows, columns), np.float32)
+        self._work = np.empty((4, columns + 1), np.float64)
+        self.live = np.empty((rows, columns, normals.LIVE), np.float32)
+
+    @staticmethod
+    def _centre_depth(channels: NDArray[np.float32]) -> float:
+        depth = channels[::9, ::9, 2]
+        depth = depth[np.isfinite(depth)]
+        return float(np.median(depth)) if depth.size else 1.0
+
+
+def grey_noise(grey: NDArray[np.float32], stride: int = 5) -> float:
+    """Relative 1-sigma of the noise of an image (height, width), NaN where invalid.
+
+    The difference of two Laplacians is blind to anything locally quadratic (Immerkaer, Computer Vision and Image
+    Understanding 64:300, 1996); the median is blind to edges. Detail finer than a cell counts as noise.
+    """
+    h, w = grey.shape
+    rows, columns = slice(1, h - 1, stride), slice(1, w - 1, stride)
+    up, down = slice(0, h - 2, stride), slice(2, h, stride)
+    left, right = slice(0, w - 2, stride), slice(2, w, stride)
+    corners = grey[up, left] + grey[up, right] + grey[down, left] + grey[down, right]
+    sides = grey[up, columns] + grey[down, columns] + grey[rows, left] + grey[rows, right]
+    response = np.abs(corners - 2.0 * sides + 4.0 * grey[rows, columns])
+    level = np.nanmedian(grey[rows, columns])
+    # 6 = root of the sum of the squared mask; 0.6745 = median of |N(0, 1)|.
+    return float(np.nanmedian(response) / (6.0 * 0.6745 * max(level, 1e-6)))

@@ -1,0 +1,272 @@
+"""The merged map (section 3.3): points nearer than the merging distance become one averaged point.
+
+A voxel hash holds one point per voxel: its mean position, normal, intensity and texture, the variance of what was
+averaged, the number of measured points, and when it was first and last seen. A point whose voxel is empty joins
+the neighbour along the viewing axis if that lies within the merging distance: noise along the ray never splits
+a surface that lies on a voxel face.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from endo3d_core import voxel_hash
+from endo3d_core.compiled import kernel
+
+MAP_POINT = np.dtype(
+    [(name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz", "intensity", "sigma")]
+    + [(name, "<i4") for name in ("count", "first_seen", "last_seen")]
+    + [(name, "<i2") for name in ("kx", "ky", "kz")]
+    + [("spare", "<i2")]
+)
+"""One merged point: position in mm in the world, unit normal towards where it was seen from, intensity in grey
+values, sigma in mm (standard deviation of the measured points along the normal; that of the mean is
+sigma / sqrt(count)), measured points, sequence numbers of the first and last cloud, voxel key."""
+
+# A row is one cache line: 16 float32, seen as int32 and int16 too.
+POS, NORMAL, GREY, VARIANCE, WEIGHT, TEXTURE = 0, 3, 6, 7, 8, 9
+COUNT, FIRST, LAST = 10, 11, 12  # int32
+KEY_X, KEY_Y, KEY_Z, PUBLISHED = 26, 27, 28, 29  # int16
+MOVED = 15
+ROW = 16
+
+CONFIRMED = 4
+"""Measured points from which on a map point is believed and published."""
+_OUTLIER_AGE = 60
+"""Clouds after which a map point that is still unconfirmed is an outlier (a third of a second)."""
+_SWEPT = 4096
+"""Rows looked at for eviction per cloud: a fixed cost instead of a pause."""
+_MOVED_MM = 0.002
+
+
+@dataclass(frozen=True, slots=True)
+class Delta:
+    """What changed since the last one."""
+
+    points: NDArray[np.void]
+    """(n,) MAP_POINT."""
+    removed: NDArray[np.int16]
+    """(m, 3) voxel keys."""
+
+
+class MergedMap:
+    """Points of ``capacity`` voxels of ``merging_distance_mm``; memory is bounded by 96 bytes for each."""
+
+    def __init__(self, merging_distance_mm: float = 0.075, capacity: int = 1_000_000) -> None:
+        if not 0.001 <= merging_distance_mm <= 10.0:
+            raise ValueError(f"a merging distance of {merging_distance_mm} mm is not within 0.001..10")
+        self.merging_distance_mm = merging_distance_mm
+        self.capacity = capacity
+        slots = 1 << max(math.ceil(math.log2(2 * capacity)), 4)
+        self._keys = np.full(slots, voxel_hash.EMPTY, np.int64)
+        self._index = np.zeros(slots, np.int32)
+        self.rows = np.zeros((capacity, ROW), np.float32)
+        self.ints = self.rows.view(np.int32)
+        self._shorts = self.rows.view(np.int16)
+        self._free = np.empty(capacity, np.int32)
+        self._dirty = np.empty(capacity, np.int32)
+        self._removed = np.empty((capacity, 3), np.int16)
+        self._touched = np.empty(1, np.int32)
+        self._counters = np.zeros(7, np.int64)
+        self.clear()
+
+    def clear(self) -> None:
+        self._keys[:] = voxel_hash.EMPTY
+        self.ints[: self.used, COUNT] = 0
+        self._counters[:] = 0
+
+    # The kernels' counters: rows ever used, free rows, dirty rows, removed keys, touched rows, sweep position, refused.
+    @property
+    def used(self) -> int:
+        """Rows in use or free again: every live row lies below."""
+        return int(self._counters[0])
+
+    @property
+    def count(self) -> int:
+        """Map points, unconfirmed ones included."""
+        return int(self._counters[0] - self._counters[1])
+
+    @property
+    def refused(self) -> int:
+        """Points that found no room since the map was made."""
+        return int(self._counters[6])
+
+    @property
+    def touched(self) -> NDArray[np.int32]:
+        """Rows that the last cloud was merged into, in the order of its grid: the visible part of the map."""
+        return self._touched[: self._counters[4]]
+
+    def merge(self, live: NDArray[np.float32], T_world_camera: NDArray[np.float64], sequence: int) -> None:
+        """Merges the points of ``live`` (rows, columns, LIVE), seen from a pose (4, 4), as cloud ``sequence``."""
+        if self._touched.size < live.shape[0] * live.shape[1]:
+            self._touched = np.empty(live.shape[0] * live.shape[1], np.int32)
+        _merge(
+            live, np.ascontiguousarray(T_world_camera, np.float64), self.merging_distance_mm, sequence,
+            self._keys, self._index, self.rows, self.ints, self._shorts,
+            self._free, self._dirty, self._touched, self._counters,
+        )  # fmt: skip
+        _sweep(
+            sequence, min(_SWEPT, self.used), self._keys, self._index, self.ints, self._shorts,
+            self._free, self._removed, self._counters,
+        )  # fmt: skip
+
+    def confirmed(self, at_least: int = CONFIRMED) -> NDArray[np.int32]:
+        """Row numbers of points with ``at_least`` so many measured points."""
+        return np.flatnonzero(self.ints[: self.used, COUNT] >= at_least).astype(np.int32)
+
+    def points(self, at_least: int = CONFIRMED) -> NDArray[np.void]:
+        """A copy of the confirmed points, (n,) MAP_POINT."""
+        return self._published(self.confirmed(at_least))
+
+    def take_delta(self) -> Delta:
+        """What is new, moved by more than 2 um or doubled its count since the last call."""
+        dirty = self._dirty[: self._counters[2]]
+        dirty = dirty[self.ints[dirty, COUNT] >= CONFIRMED]
+        delta = Delta(self._published(dirty), self._removed[: self._counters[3]].copy())
+        _mark_published(dirty, self.rows, self.ints, self._shorts)
+        self._counters[2:4] = 0
+        return delta
+
+    def _published(self, rows: NDArray[np.int32]) -> NDArray[np.void]:
+        out = np.zeros(len(rows), MAP_POINT)
+        values, ints, shorts = self.rows[rows], self.ints[rows], self._shorts[rows]
+        for i, name in enumerate(("x", "y", "z", "nx", "ny", "nz", "intensity")):
+            out[name] = values[:, i]
+        out["sigma"] = np.sqrt(values[:, VARIANCE])
+        for i, name in enumerate(("count", "first_seen", "last_seen")):
+            out[name] = ints[:, COUNT + i]
+        for i, name in enumerate(("kx", "ky", "kz")):
+            out[name] = shorts[:, KEY_X + i]
+        return out
+
+
+@kernel
+def _along_axis(keys, index, rows, kx, ky, kz, axis, place, d):  # type: ignore[no-untyped-def]
+    """The row of the voxel before or behind along ``axis`` whose point lies within d of ``place``, or -1."""
+    best, best_gap = np.int64(-1), np.float32(d)
+    for step in (-1, 1):
+        key = voxel_hash.pack(
+            kx + (step if axis == 0 else 0), ky + (step if axis == 1 else 0), kz + (step if axis == 2 else 0)
+        )
+        row = voxel_hash.find(keys, index, key)
+        if row >= 0:
+            gap = abs(rows[row, axis] - place)
+            if gap < best_gap:
+                best, best_gap = row, gap
+    return best
+
+
+@kernel
+def _merge(  # type: ignore[no-untyped-def]
+    live, T, d, sequence, keys, index, rows, ints, shorts, free, dirty, touched, counters
+):
+    r00, r01, r02, tx = np.float32(T[0, 0]), np.float32(T[0, 1]), np.float32(T[0, 2]), np.float32(T[0, 3])
+    r10, r11, r12, ty = np.float32(T[1, 0]), np.float32(T[1, 1]), np.float32(T[1, 2]), np.float32(T[1, 3])
+    r20, r21, r22, tz = np.float32(T[2, 0]), np.float32(T[2, 1]), np.float32(T[2, 2]), np.float32(T[2, 3])
+    axis = 2
+    if abs(r02) > abs(r12) and abs(r02) > abs(r22):
+        axis = 0
+    elif abs(r12) > abs(r22):
+        axis = 1
+    per_voxel, one = np.float32(1.0 / d), np.float32(1.0)
+    counters[4] = 0
+    for r in range(live.shape[0]):
+        for c in range(live.shape[1]):
+            p = live[r, c]
+            if not p[2] == p[2]:
+                continue
+            x = r00 * p[0] + r01 * p[1] + r02 * p[2] + tx
+            y = r10 * p[0] + r11 * p[1] + r12 * p[2] + ty
+            z = r20 * p[0] + r21 * p[1] + r22 * p[2] + tz
+            kx, ky, kz = (
+                np.int64(math.floor(x * per_voxel)), np.int64(math.floor(y * per_voxel)),
+                np.int64(math.floor(z * per_voxel)),
+            )  # fmt: skip
+            if max(abs(kx), abs(ky), abs(kz)) >= voxel_hash.KEY_LIMIT:
+                counters[6] += 1
+                continue
+            key = voxel_hash.pack(kx, ky, kz)
+            row = voxel_hash.find(keys, index, key)
+            if row < 0:
+                row = _along_axis(keys, index, rows, kx, ky, kz, axis, x if axis == 0 else (y if axis == 1 else z), d)
+            if row < 0:
+                if counters[1] > 0:
+                    counters[1] -= 1
+                    row = np.int64(free[counters[1]])
+                elif counters[0] < rows.shape[0]:
+                    row = counters[0]
+                    counters[0] += 1
+                else:
+                    counters[6] += 1
+                    continue
+                voxel_hash.insert(keys, index, key, row)
+                rows[row] = np.float32(0.0)
+                rows[row, 0], rows[row, 1], rows[row, 2] = x, y, z
+                shorts[row, KEY_X], shorts[row, KEY_Y], shorts[row, KEY_Z] = kx, ky, kz
+                ints[row, FIRST] = sequence
+                ints[row, LAST] = sequence - 1
+            point = rows[row]
+            point[WEIGHT] += p[9]
+            share = p[9] / point[WEIGHT]
+            dx, dy, dz = x - point[0], y - point[1], z - point[2]
+            point[0] += share * dx
+            point[1] += share * dy
+            point[2] += share * dz
+            if p[3] == p[3]:
+                nx = r00 * p[3] + r01 * p[4] + r02 * p[5]
+                ny = r10 * p[3] + r11 * p[4] + r12 * p[5]
+                nz = r20 * p[3] + r21 * p[4] + r22 * p[5]
+                fresh = point[3] * point[3] + point[4] * point[4] + point[5] * point[5] == np.float32(0.0)
+                blend = one if fresh else share
+                nx, ny, nz = point[3] + blend * (nx - point[3]), point[4] + blend * (ny - point[4]), point[5] + blend * (nz - point[5])
+                scale = one / np.sqrt(nx * nx + ny * ny + nz * nz)
+                point[3], point[4], point[5] = nx * scale, ny * scale, nz * scale
+            off = point[3] * dx + point[4] * dy + point[5] * dz
+            point[VARIANCE] = (one - share) * (point[VARIANCE] + share * off * off)
+            point[MOVED] += share * off
+            point[GREY] += share * (p[10] - point[GREY])
+            point[TEXTURE] += share * (p[6] - point[TEXTURE])
+            ints[row, COUNT] += 1
+            if ints[row, LAST] != sequence:
+                ints[row, LAST] = sequence
+                touched[counters[4]] = row
+                counters[4] += 1
+            # Published holds twice the exponent of the last published count, plus one while the row waits.
+            state = np.int64(shorts[row, PUBLISHED])
+            if (state & 1) == 0 and ints[row, COUNT] >= CONFIRMED:
+                if (ints[row, COUNT] >> (state >> 1)) > 1 or abs(point[MOVED]) > np.float32(_MOVED_MM) or state == 0:
+                    shorts[row, PUBLISHED] = state | 1
+                    dirty[counters[2]] = row
+                    counters[2] += 1
+
+
+@kernel
+def _mark_published(dirty, rows, ints, shorts):  # type: ignore[no-untyped-def]
+    for i in range(dirty.size):
+        row = dirty[i]
+        exponent = 0
+        while (ints[row, COUNT] >> (exponent + 1)) > 0:
+            exponent += 1
+        shorts[row, PUBLISHED] = 2 * exponent
+        rows[row, MOVED] = np.float32(0.0)
+
+
+@kernel
+def _sweep(sequence, amount, keys, index, ints, shorts, free, removed, counters):  # type: ignore[no-untyped-def]
+    """Looks at the next ``amount`` rows and evicts those that were never confirmed (section 3.3: outliers)."""
+    used = counters[0]
+    for _ in range(amount):
+        row = counters[5]
+        counters[5] = row + 1 if row + 1 < used else 0
+        if 0 < ints[row, COUNT] < CONFIRMED and sequence - ints[row, LAST] > _OUTLIER_AGE:
+            voxel_hash.remove(
+                keys, index,
+                voxel_hash.pack(np.int64(shorts[row, KEY_X]), np.int64(shorts[row, KEY_Y]), np.int64(shorts[row, KEY_Z])),
+            )  # fmt: skip
+            ints[row, COUNT] = 0
+            free[counters[1]] = row
+            counters[1] += 1

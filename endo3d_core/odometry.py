@@ -1,0 +1,148 @@
+"""Hand-guided odometry: predict, register against the map, merge (section 3.3)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from endo3d_core import health, rigid
+from endo3d_core.live_view import LiveView
+from endo3d_core.merging import MergedMap
+from endo3d_core.registration import Linearisation, visible_surface
+
+Array = NDArray[np.float64]
+
+ITERATIONS = 4
+_CONVERGED = 0.02
+"""A step smaller than this, in point sigmas, ends the iteration."""
+_LEAST_SHARE = 0.35
+"""Of the visible map points that must agree with the cloud."""
+_LEAST_POINTS = 300
+_LONGEST_GAP_NS = 50_000_000
+"""After a longer gap the last velocity says nothing about a hand."""
+
+
+class State(StrEnum):
+    TRACKING = "tracking"
+    DEGENERATE = "degenerate"
+    LOST = "lost"
+    RELOCALISED = "relocalised"
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """One cloud's pose and how well it is known."""
+
+    T_world_camera: Array
+    information: Array
+    """(6, 6) of (translation mm, rotation rad) in the camera's axes."""
+    state: State
+    sigma_weak_mm: float
+    weak_direction: Array
+    """(6,) unit vector: translation, and rotation scaled by the radius of the visible surface."""
+    inlier_share: float
+    residual_mm: float
+    photometric_share: float
+    submap: int
+
+
+class Odometry:
+    """Tracks clouds against the map they are merged into."""
+
+    def __init__(self, merging_distance_mm: float = 0.075, capacity: int = 1_000_000) -> None:
+        self.map = MergedMap(merging_distance_mm, capacity)
+        self.view = LiveView()
+        self._equations = Linearisation()
+        self.reset()
+
+    def reset(self) -> None:
+        """Empty map; the next cloud's camera is the world."""
+        self.map.clear()
+        self.T_world_camera = np.eye(4)
+        self._velocity = np.zeros(6)
+        self._last_ns: int | None = None
+        self._step_ns = 1
+        self._scale_mm = np.nan
+        self._texture_scale = 0.1
+        self.submap = 0
+
+    def track(self, channels: NDArray[np.float32], sequence: int, stamp_ns: int) -> Estimate:
+        """One cloud (height, width, 6) float32: x y z mm, intensity, quality, sigma mm."""
+        self.view.load(channels)
+        if self._last_ns is None:
+            return self._begin(sequence, stamp_ns)
+        predicted = self._predict(stamp_ns)
+        estimate = self._register(predicted, stamp_ns)
+        if estimate.state is not State.LOST:
+            self.map.merge(self.view.live, estimate.T_world_camera, sequence)
+        return estimate
+
+    def _begin(self, sequence: int, stamp_ns: int) -> Estimate:
+        self._last_ns = stamp_ns
+        self._scale_mm = 2.0 * self.view.sigma_mm
+        self.map.merge(self.view.live, self.T_world_camera, sequence)
+        return Estimate(
+            self.T_world_camera, np.diag(np.full(6, 1e12)), State.TRACKING, 0.0, np.zeros(6), 1.0, 0.0, 0.0, self.submap
+        )
+
+    def _predict(self, stamp_ns: int) -> Array:
+        assert self._last_ns is not None
+        gap_ns = stamp_ns - self._last_ns
+        if not 0 < gap_ns <= _LONGEST_GAP_NS:
+            return self.T_world_camera
+        return self.T_world_camera @ rigid.exp(self._velocity * gap_ns)
+
+    def _register(self, predicted: Array, stamp_ns: int) -> Estimate:
+        view, sigma_mm = self.view, self.view.sigma_mm
+        centre, radius_mm = visible_surface(view.live)
+        T = predicted
+        rows = self.map.touched
+        photometric = True
+        gate_mm = 8.0 * self._scale_mm + view.pitch_mm
+        for _ in range(ITERATIONS):
+            n = self._equations.at(
+                T, self.map, rows, view.live, view.coefficients, centre=centre, radius_mm=radius_mm, gate_mm=gate_mm,
+                scale_mm=self._scale_mm, texture_scale=self._texture_scale,
+                texture_sigma=view.texture_sigma, normal_sigma=view.normal_sigma(),
+                photometric=photometric,
+            )  # fmt: skip
+            if n.used < _LEAST_POINTS:
+                break
+            solution = health.solve(n, sigma_mm)
+            T = T @ health.motion(solution.step, centre, radius_mm)
+            self._scale_mm = float(np.clip(n.residual_mm, sigma_mm, 4.0 * sigma_mm))
+            if n.textured:
+                self._texture_scale = float(np.clip(n.texture_residual, 1e-4, 0.3))
+            gate_mm = 8.0 * self._scale_mm
+            if np.linalg.norm(solution.step) < _CONVERGED * sigma_mm:
+                break
+        share = n.used / max(n.visible, 1)
+        if n.used < _LEAST_POINTS or share < _LEAST_SHARE:
+            return Estimate(
+                self.T_world_camera, np.zeros((6, 6)), State.LOST, np.inf, np.zeros(6), share, n.residual_mm, 0.0,
+                self.submap,
+            )  # fmt: skip
+        T = rigid.orthonormal(T)
+        self._advance(T, stamp_ns, solution.held, centre, radius_mm)
+        return Estimate(
+            T_world_camera=T,
+            information=health.at_camera(solution.information, centre, radius_mm),
+            state=State.DEGENERATE if solution.held.size else State.TRACKING,
+            sigma_weak_mm=solution.sigma_weak_mm,
+            weak_direction=solution.weak_direction,
+            inlier_share=share,
+            residual_mm=n.residual_mm,
+            photometric_share=solution.photometric_share,
+            submap=self.submap,
+        )
+
+    def _advance(self, T: Array, stamp_ns: int, held: Array, centre: Array, radius_mm: float) -> None:
+        """The new pose, and the velocity for the next prediction: none along held directions."""
+        assert self._last_ns is not None
+        moved = health.scaled_twist(rigid.inverse(self.T_world_camera) @ T, centre, radius_mm)
+        moved -= held @ (held.T @ moved)
+        self._velocity = rigid.log(health.motion(moved, centre, radius_mm)) / max(stamp_ns - self._last_ns, 1)
+        self.T_world_camera, self._last_ns = T, stamp_ns
