@@ -42,7 +42,8 @@ def _mapped(
 
 @dataclass(frozen=True, eq=False)
 class Lens:
-    """A pinhole with Brown-Conrady distortion: of the camera, or of the projector seen as an inverse camera."""
+    """A pinhole with Brown-Conrady distortion: of the camera, or of the projector seen as an inverse
+    camera."""
 
     width: int
     height: int
@@ -145,10 +146,8 @@ class Rig:
             raise ValueError(f"the calibration is not YAML: {str(error).splitlines()[0]}") from error
         if not isinstance(tree, Mapping):
             raise ValueError("the calibration needs the sections camera, projector, R and t")
-        camera, projector = (
-            _section(tree, name, lambda section, name=name: _lens(section, name))
-            for name in ("camera", "projector")
-        )
+        camera = _section(tree, "camera", lambda value: _lens(value, "camera"))
+        projector = _section(tree, "projector", lambda value: _lens(value, "projector"))
         R = _section(tree, "R", lambda value: _numbers(value, 9, "R"))
         t = _section(tree, "t", lambda value: _numbers(value, 3, "t"))
         return cls(camera, projector, R.reshape(3, 3), t)

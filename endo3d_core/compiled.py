@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import numba
 
@@ -15,9 +15,9 @@ FASTMATH = {"contract", "reassoc", "arcp", "nsz"}
 
 def kernel(function: F) -> F:
     """Compile a loop for the machine: no GIL, cached on disk, vectorisable sums, NaN kept."""
-    return numba.njit(nogil=True, cache=True, fastmath=FASTMATH, error_model="numpy")(function)  # type: ignore[no-any-return]
+    return cast(F, numba.njit(nogil=True, cache=True, fastmath=FASTMATH, error_model="numpy")(function))
 
 
 def exact(function: F) -> F:
     """The same in strict IEEE arithmetic: for geometry in float64."""
-    return numba.njit(nogil=True, cache=True, error_model="numpy")(function)  # type: ignore[no-any-return]
+    return cast(F, numba.njit(nogil=True, cache=True, error_model="numpy")(function))

@@ -1,12 +1,12 @@
 """Pattern sequences as data: what the projector shows, slot by slot, and its canonical text.
 
-A pattern's intensity at projector pixel x (0-based, of N along its axis) is 1/2 + 1/2 cos(2 pi f x / N + shift),
-eq. (2) of the paper; a binary pattern is its sign. The text travels with every frame, so frames and a
+A pattern's intensity at projector pixel x (0-based, of N along its axis) is 1/2 + 1/2 cos(2 pi f x / N +
+shift), eq. (2) of the paper; a binary pattern is its sign. The text travels with every frame, so frames and a
 calibration are all that decoding needs:
 
-    interleaved f1=25                              (f1,0) (f1-1,0) (f1,pi) (f1-1,pi): any three in a row decode
-    conventional f=50/49/43 steps=4/2/2            n-step highest frequency, two-step lower ones (Peng and Gupta)
-    conventional f=50/49/43 steps=4/2/2 exposures_us=10200/40800/163200
+    interleaved f1=25                              (f1,0) (f1-1,0) (f1,pi) (f1-1,pi): any three in a row
+    decode conventional f=50/49/43 steps=4/2/2            n-step highest frequency, two-step lower ones
+    (Peng and Gupta) conventional f=50/49/43 steps=4/2/2 exposures_us=10200/40800/163200
     sequence f=28.8/28.8/19.2 shifts=0/1.57/0      any list, one frequency and one shift in rad per pattern
 
 Options of every kind: ``axis=rows`` (the phase grows down the rows; columns is the default), ``wave=binary``,
@@ -86,7 +86,8 @@ def image(pattern: Pattern, width: int, height: int) -> NDArray[np.uint8]:
 
 
 def profile(pattern: Pattern, position_px: NDArray[np.generic], n: int) -> NDArray[np.float64]:
-    """Wanted light (0..1) at projector positions along the axis, ``n`` pixels long; positions may be fractions."""
+    """Wanted light (0..1) at projector positions along the axis, ``n`` pixels long; positions may be
+    fractions."""
     phase = TWO_PI * pattern.frequency * np.asarray(position_px, np.float64) / n + pattern.shift_rad
     wave = np.cos(phase)
     return 0.5 + 0.5 * (np.where(wave >= 0.0, 1.0, -1.0) if pattern.wave == "binary" else wave)
@@ -109,7 +110,8 @@ def conventional(
     wave: Wave = "sine",
     gamma: float = 1.0,
 ) -> PatternSet:
-    """Section 3.1: n evenly spaced steps of the first frequency; two-step ones are 0 and pi/2 and share its background.
+    """Section 3.1: n evenly spaced steps of the first frequency; two-step ones are 0 and pi/2 and share
+    its background.
 
     With several exposures the whole list repeats, once per exposure.
     """
@@ -172,6 +174,8 @@ _KEYS = {
     "sequence": {"f", "shifts", "exposures_us"},
 }
 _OPTIONS = {"axis", "wave", "gamma"}
+_AXES: dict[str, Axis] = {"columns": "columns", "rows": "rows"}
+_WAVES: dict[str, Wave] = {"sine": "sine", "binary": "binary"}
 
 
 @lru_cache(maxsize=64)
@@ -187,8 +191,8 @@ def parse(text: str) -> PatternSet:
             known = ", ".join(sorted(_KEYS[kind] | _OPTIONS))
             raise ValueError(f"pattern set {text!r}: {word!r} is not key=value with one of: {known}")
         values[key] = value
-    axis, wave = values.get("axis", "columns"), values.get("wave", "sine")
-    if axis not in ("columns", "rows") or wave not in ("sine", "binary"):
+    axis, wave = _AXES.get(values.get("axis", "columns")), _WAVES.get(values.get("wave", "sine"))
+    if axis is None or wave is None:
         raise ValueError(f"pattern set {text!r}: axis is columns or rows, wave is sine or binary")
     gamma = _floats(text, values, "gamma", (1.0,))[0]
     if not gamma > 0:

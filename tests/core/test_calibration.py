@@ -5,9 +5,10 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
-from endo3d_core.calibration import Lens, Rig
 from hypothesis import given
 from hypothesis import strategies as st
+
+from endo3d_core.calibration import Lens, Rig
 
 K = np.array([[1991.0, 0.0, 960.0], [0.0, 1988.0, 600.0], [0.0, 0.0, 1.0]])
 coefficient = st.floats(-0.15, 0.15)

@@ -6,10 +6,11 @@ import math
 
 import numpy as np
 import pytest
-from endo3d_core import patterns
-from endo3d_core.patterns import Pattern
 from hypothesis import given
 from hypothesis import strategies as st
+
+from endo3d_core import patterns
+from endo3d_core.patterns import Pattern
 
 TEXTS = [
     "interleaved f1=25",

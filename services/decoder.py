@@ -1,0 +1,228 @@
+"""Frames in, clouds and depth maps out: at camera rate in the continuous mode, once per sequence
+otherwise."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from endo3d.schemas import topics
+from endo3d.schemas.messages import (
+    POINT,
+    CameraCalibration,
+    Cloud,
+    DepthMap,
+    Frame,
+    Message,
+    ProjectorCalibration,
+)
+from endo3d.services.runtime import service
+from endo3d.services.runtime.errors import UserError
+from endo3d_core import patterns, triangulation
+from endo3d_core.binning import BINS
+from endo3d_core.calibration import Lens, Rig
+from endo3d_core.conventional import Conventional
+from endo3d_core.head import Head
+from endo3d_core.interleaved import Form, Interleaved
+from endo3d_core.uncertainty import Sensor
+
+GRID_WIDTH = 480
+"""About the fibre's resolution: bins are chosen to come near it."""
+CHANNELS = 6
+"""Of a point: x y z intensity quality sigma."""
+DEPTH_STEPS = 65_000
+"""Of a depth map over the depth range: 0.1 um for 7 mm."""
+FULL_WELL_ELECTRONS = 32_000.0
+READ_NOISE_ELECTRONS = 7.0
+
+
+class DecoderConfig(service.Config):
+    head: str = ""
+    """Calibration file to start with; calibration messages replace it."""
+    bin_px: Literal[1, 2, 4] | None = None
+    """Camera pixels per grid step; by default as many as make a grid of about the fibre's resolution."""
+    form: Form = "reuse"
+    """How the continuous mode is decoded."""
+    z_min_mm: float | None = None
+    z_max_mm: float | None = None
+    """Depth range; by default the head's."""
+    dark_grey: float = 2.0
+    """Mean grey value below which nothing is measured, of 255."""
+    depth: bool = True
+    """Publish the 16-bit depth map beside the cloud."""
+
+
+class Decoder(service.Service[DecoderConfig]):
+    """Decodes whatever pattern set the frames say they show."""
+
+    Config = DecoderConfig
+    reads = (topics.FRAME, topics.CAMERA, topics.PROJECTOR)
+    writes = (topics.CLOUD, topics.DEPTH)
+
+    def __init__(self, config: DecoderConfig) -> None:
+        super().__init__(config)
+        self.rig: Rig | None = None
+        self.z_range_mm = (0.0, 0.0)
+        self._camera: CameraCalibration | None = None
+        self._projector: ProjectorCalibration | None = None
+        self._decoders: dict[tuple[str, tuple[int, ...], str], Interleaved | Conventional] = {}
+        self._current: Interleaved | Conventional | None = None
+        self._window: deque[tuple[int, int]] = deque(maxlen=8)
+        self._last: tuple[int, int] | None = None
+        self._counts = {"windows_dropped": 0.0, "valid_share": 0.0}
+
+    def open(self) -> None:
+        """Read the head's file, if there is one."""
+        if not self.config.head:
+            return
+        try:
+            text = Path(self.config.head).read_text()
+            self._calibrate(Rig.from_yaml(text), text)
+        except (OSError, ValueError) as error:
+            raise UserError(f"decoder: {self.config.head}: {error}") from error
+
+    def warm(self) -> None:
+        """Compile every kernel on a small image."""
+        if self.rig is None:
+            return
+        small = Rig(self.rig.camera.binned(8), self.rig.projector, self.rig.R, self.rig.t)
+        image = np.full((small.camera.height, small.camera.width), 100, np.uint8)
+        for text in ("interleaved f1=3", "conventional f=4/3 steps=3/2"):
+            for bin_px in BINS:
+                decoder = self._build(text, small, bin_px, np.dtype(np.uint8))
+                out = np.empty((decoder.lookup.height, decoder.lookup.width, CHANNELS), np.float32)
+                for k in range(decoder.frames):
+                    decoder.push(image, k % len(patterns.parse(text)))
+                decoder.points(out)
+                triangulation.write_depth(out, 1.0, 0.0, np.empty(out.shape[:2], np.uint16))
+
+    def step(self, message: Message) -> Iterator[Message]:
+        match message:
+            case Frame():
+                yield from self._frame(message)
+            case CameraCalibration():
+                self._camera = message
+                self._calibrate_from_messages()
+            case ProjectorCalibration():
+                self._projector = message
+                self._calibrate_from_messages()
+
+    def values(self) -> Mapping[str, float]:
+        return self._counts
+
+    def _frame(self, frame: Frame) -> Iterator[Message]:
+        decoder = self._decoder_for(frame)
+        if decoder is None:
+            return
+        if self._last not in (None, (frame.epoch, frame.sequence - 1)):
+            # A lost frame or another start of the projector: these never decode together.
+            self._counts["windows_dropped"] += 1.0
+            decoder.reset()
+        self._last = (frame.epoch, frame.sequence)
+        self._window.append((frame.stamp_ns, frame.sequence))
+        if decoder.push(frame.image, frame.slot):
+            yield from self._publish(frame, decoder)
+
+    def _publish(self, frame: Frame, decoder: Interleaved | Conventional) -> Iterator[Message]:
+        stamp_ns, sequence = self._window[-1 - decoder.latency]
+        shape = (decoder.lookup.height, decoder.lookup.width)
+        if decoder.lookup.axis == "rows":
+            shape = shape[::-1]
+        points = self.loan(topics.CLOUD, shape, POINT)
+        channels = points.view(np.float32).reshape(*shape, CHANNELS)
+        valid = decoder.points(channels)
+        self._counts["valid_share"] = valid / points.size
+        grid_px = float(decoder.bin_px)
+        yield Cloud(
+            stamp_ns=stamp_ns,
+            sequence=sequence,
+            points=points,
+            window_frames=decoder.frames,
+            newest_stamp_ns=frame.stamp_ns,
+            epoch=frame.epoch,
+            pattern_set=frame.pattern_set,
+            grid_px=grid_px,
+            valid_count=valid,
+            frame_id=frame.frame_id,
+        )
+        if self.config.depth:
+            depth = self.loan(topics.DEPTH, shape, np.uint16)
+            z_min, z_max = self.z_range_mm
+            scale = (z_max - z_min) / DEPTH_STEPS
+            triangulation.write_depth(channels, scale, z_min - scale, depth)
+            yield DepthMap(stamp_ns, sequence, depth, scale, z_min - scale, grid_px, frame.frame_id)
+
+    def _decoder_for(self, frame: Frame) -> Interleaved | Conventional | None:
+        """The decoder of this frame's pattern set and size; None before any calibration came."""
+        if self.rig is None:
+            return None
+        key = (frame.pattern_set, frame.image.shape, frame.image.dtype.str)
+        if key not in self._decoders:
+            rig = Rig(_lens_of(self.rig.camera, frame), self.rig.projector, self.rig.R, self.rig.t)
+            bin_px = self.config.bin_px or _bins_for(frame.image.shape[1])
+            self._decoders[key] = self._build(frame.pattern_set, rig, bin_px, frame.image.dtype)
+        decoder = self._decoders[key]
+        if self._current is not decoder:
+            decoder.reset()
+            self._current = decoder
+        return decoder
+
+    def _build(
+        self, text: str, rig: Rig, bin_px: int, dtype: np.dtype[np.uint8] | np.dtype[np.uint16]
+    ) -> Interleaved | Conventional:
+        pattern_set = patterns.parse(text)
+        lookup = triangulation.build(rig, bin_px, *self.z_range_mm, pattern_set.axis)
+        full_grey = float(np.iinfo(dtype).max)
+        sensor = Sensor(FULL_WELL_ELECTRONS / full_grey, READ_NOISE_ELECTRONS)
+        dark_grey = self.config.dark_grey * full_grey / 255.0
+        if pattern_set.kind == "interleaved":
+            return Interleaved(
+                pattern_set, lookup, bin_px, form=self.config.form, dark_grey=dark_grey, sensor=sensor
+            )
+        return Conventional(pattern_set, lookup, bin_px, dtype.type, dark_grey=dark_grey, sensor=sensor)
+
+    def _calibrate_from_messages(self) -> None:
+        camera, projector = self._camera, self._projector
+        if camera is None or projector is None:
+            return
+        T = projector.T_projector_camera
+        rig = Rig(
+            Lens(camera.width, camera.height, camera.K, camera.dist),
+            Lens(projector.width, projector.height, projector.K, projector.dist),
+            T[:3, :3],
+            T[:3, 3],
+        )
+        self._calibrate(rig, projector.yaml)
+
+    def _calibrate(self, rig: Rig, yaml: str) -> None:
+        """Take a calibration, unless it is the one in use: then the windows go on."""
+        z_min, z_max = self.config.z_min_mm, self.config.z_max_mm
+        if z_min is None or z_max is None:
+            head = Head.from_yaml(yaml)
+            z_min, z_max = z_min or head.z_min_mm, z_max or head.z_max_mm
+        if self.rig is not None and rig.to_yaml() == self.rig.to_yaml() and self.z_range_mm == (z_min, z_max):
+            return
+        self.rig, self.z_range_mm = rig, (z_min, z_max)
+        self._decoders.clear()
+        self._current = None
+
+
+def _bins_for(width_px: int) -> int:
+    return min(BINS, key=lambda bin_px: abs(width_px / bin_px - GRID_WIDTH))
+
+
+def _lens_of(camera: Lens, frame: Frame) -> Lens:
+    """The calibrated camera, binned to the frame's size if the camera bins. Raises ``UserError``
+    otherwise."""
+    height, width = frame.image.shape
+    factor = camera.width // width
+    if factor < 1 or (width * factor, height * factor) != (camera.width, camera.height):
+        raise UserError(
+            f"decoder: frames of {width}x{height}, calibration of {camera.width}x{camera.height}; "
+            "use the calibration of this camera format"
+        )
+    return camera if factor == 1 else camera.binned(factor)
