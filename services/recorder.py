@@ -3,21 +3,27 @@
 from __future__ import annotations
 
 import logging
+import threading
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
 from pydantic import Field
 
 from endo3d.schemas import codec, topics
-from endo3d.schemas.messages import Message, ProjectorCalibration
+from endo3d.schemas.messages import Frame, Message, ProjectorCalibration
 from endo3d.schemas.topics import Topic
-from endo3d.services.archive.entry import CALIBRATION_FILE, STACK_FILE, Attachment, Entry
+from endo3d.services.archive.crop import Crop
+from endo3d.services.archive.entry import CALIBRATION_FILE, COMPACT_IMAGE, STACK_FILE, Attachment, Entry
 from endo3d.services.archive.facts import host_facts
+from endo3d.services.archive.layout import Buffer
+from endo3d.services.archive.reader import Unreadable
 from endo3d.services.archive.recording import Recording
+from endo3d.services.archive.recover import is_torn, recover
 from endo3d.services.archive.spool import Spool
 from endo3d.services.archive.writer import Kind
 from endo3d.services.runtime.service import Config, Refused, Sample, Tap
@@ -43,9 +49,14 @@ class RecorderConfig(Config):
     """Recording stops, whole, when the disk has less than this left."""
     reserve_mb: int = Field(default=64, ge=0)
     """Disk space kept for the file's index in case somebody else fills the disk."""
+    compact: bool = False
+    """Pack frames without loss, about 2:1; only endo3d reads them then."""
+    crop: bool = False
+    """Keep of each frame only the square around the fibre's image circle; the rest is dark."""
     log_hz: dict[str, float] = Field(default_factory=dict)
     """Rates to archive, by topic, where they differ from the topics table; 0 is never."""
     rig: str = "rig"
+    head: str = ""
     stack_toml: str = ""
 
 
@@ -70,19 +81,29 @@ class Recorder(Tap[RecorderConfig]):
         self._due_ns: dict[str, int] = {}
         self._latched: dict[str, Entry] = {}
         self._lost: Counter[str] = Counter()
+        self._transform: Callable[[Entry], Entry] = _as_it_is
+        self._crop: Crop | None = None
         self._spool: Spool | None = None
         self._start_at_next = config.autostart
 
+    def open(self) -> None:
+        """Repair what a crash left torn in the directory, in the background. Raises ``UserError``."""
+        self._transform = _compactor() if self.config.compact else _as_it_is
+        if self.config.directory.is_dir():
+            repair = partial(_repair, self.config.directory)
+            threading.Thread(target=repair, name="repair", daemon=True).start()
+
     def take(self, sample: Sample) -> Iterator[Message]:
         try:
-            entry = self._entry(sample)
+            message = codec.decode(sample.topic, sample.payload)
         except codec.Malformed:
             self._lost[f"{sample.topic.name}:malformed"] += 1
             return
+        entry = self._entry(sample, message)
         if self._start_at_next:
             self._start(self.config.name, sample.received_ns)
         if self._spool is not None and self._due(entry, sample.topic):
-            self._spool.put(entry, sample.valid)
+            self._put(self._spool, entry, sample, message)
         if entry.latched:
             self._latched[entry.channel] = replace(entry, payload=(bytes(sample.payload),))
         yield from ()
@@ -133,9 +154,8 @@ class Recorder(Tap[RecorderConfig]):
     def close(self) -> None:
         self._stop()
 
-    def _entry(self, sample: Sample) -> Entry:
-        """Where a sample goes in the log. Raises ``codec.Malformed``."""
-        message = codec.decode(sample.topic, sample.payload)
+    def _entry(self, sample: Sample, message: Message) -> Entry:
+        """Where a sample goes in the log; its payload is still the sender's."""
         attachment = None
         if isinstance(message, ProjectorCalibration) and message.yaml:
             attachment = Attachment(CALIBRATION_FILE, "application/yaml", message.yaml.encode())
@@ -149,6 +169,33 @@ class Recorder(Tap[RecorderConfig]):
             latched=sample.topic.latched,
             attachment=attachment,
         )
+
+    def _put(self, spool: Spool, entry: Entry, sample: Sample, message: Message) -> None:
+        """Queue a sample: the received bytes, or those of the image circle alone."""
+        if isinstance(message, Frame):
+            if self.config.crop and self._crop is None:
+                self._crop = self._circle(*message.image.shape)
+            if self._crop is not None:
+                if message.image.shape != (self._crop.of_rows, self._crop.of_columns):
+                    self._lost["frame:other size than the recording's first"] += 1
+                    return
+                message = self._crop.cut(message)
+                entry = replace(entry, metadata=self._crop.metadata())
+            foreign = self.config.compact and codec.data_span(sample.payload)[1] != len(sample.payload)
+            if self._crop is not None or foreign:
+                size = codec.encoded_size(message)
+                spool.put(entry, size, partial(codec.encode_into, message), sample.valid)
+                return
+        spool.put(entry, len(sample.payload), partial(_copy, sample.payload), sample.valid)
+
+    def _circle(self, rows: int, columns: int) -> Crop:
+        """What to keep of an image: where the camera fibre is imaged, as the head's file says."""
+        from endo3d_core.calibration import Rig  # its kernels take a second to load
+        from endo3d_core.head import Head
+
+        text = Path(self.config.head).read_text(encoding="utf-8")
+        scale = columns / Rig.from_yaml(text).camera.width
+        return Crop.around_circle(Head.from_yaml(text).camera_circle_px * scale, rows, columns)
 
     def _due(self, entry: Entry, topic: Topic) -> bool:
         """Whether the topic's archive rate has room for this message."""
@@ -176,9 +223,13 @@ class Recorder(Tap[RecorderConfig]):
             queue_bytes=config.queue_mb << 20,
             floor_bytes=config.floor_mb << 20,
             reserve_bytes=config.reserve_mb << 20,
+            transform=self._transform,
         )
+        self._due_ns.clear()
+        self._crop = None
         for entry in self._latched.values():
-            self._spool.put(replace(entry, log_ns=now_ns))
+            (payload,) = entry.payload
+            self._spool.put(replace(entry, log_ns=now_ns), len(payload), partial(_copy, payload))
         _log.info("recording %s", recording.path)
         return self._spool
 
@@ -193,6 +244,40 @@ class Recorder(Tap[RecorderConfig]):
 def _period_ns(rate_hz: float) -> int | None:
     """Time between archived messages; None is never."""
     return round(1e9 / rate_hz) if rate_hz > 0 else None
+
+
+def _copy(payload: Buffer, memory: memoryview) -> None:
+    memory[:] = payload
+
+
+def _as_it_is(entry: Entry) -> Entry:
+    return entry
+
+
+def _compactor() -> Callable[[Entry], Entry]:
+    """Packs frames and leaves the rest alone."""
+    from endo3d.services.archive.compact import Packer  # its kernels take a second to load
+
+    pack = Packer()
+    channel = topics.FRAME.channel()
+
+    def packed(entry: Entry) -> Entry:
+        if entry.channel != channel:
+            return entry
+        return replace(entry, kind=COMPACT_IMAGE, payload=pack(memoryview(entry.payload[0])))
+
+    return packed
+
+
+def _repair(directory: Path) -> None:
+    """Give every torn log here its index; one that is being recorded, or beyond repair, stays as it is."""
+    for path in sorted(directory.glob("*.mcap")):
+        try:
+            if is_torn(path):
+                report = recover(path)
+                _log.warning("repaired %s: %d messages kept", path, report.messages)
+        except (Unreadable, OSError) as error:
+            _log.warning("%s", error)
 
 
 def _causes(spool: Spool) -> Mapping[str, int]:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 from endo3d.services.archive.layout import Buffer
 from endo3d.services.archive.writer import Kind
@@ -10,6 +11,9 @@ from endo3d.services.archive.writer import Kind
 STACK_FILE = "stack.toml"
 CALIBRATION_FILE = "calibration.yaml"
 """What every log carries along, by the attachment's name."""
+
+COMPACT_IMAGE = Kind("endo3d.CompactImage", "endo3d.compact", b"")
+"""Frames packed without loss: ``archive.compact``. Without a definition: only this program reads them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,6 +38,8 @@ class Entry:
     """Its own stamp: the exposure."""
     payload: tuple[Buffer, ...]
     """The encoded message, in one or several parts."""
+    metadata: Mapping[str, str] = field(default_factory=dict)
+    """Of the channel; what the first entry of a channel says holds for all."""
     latched: bool = False
     """Every part of a split recording repeats the last one."""
     attachment: Attachment | None = None

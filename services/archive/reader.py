@@ -31,9 +31,11 @@ from mcap.records import (
 from mcap.stream_reader import get_chunk_data_stream
 
 from endo3d.schemas import codec, topics
-from endo3d.schemas.messages import Message
+from endo3d.schemas.messages import Frame, Message
 from endo3d.schemas.topics import Topic
 from endo3d.services.archive import layout
+from endo3d.services.archive.crop import Crop
+from endo3d.services.archive.entry import COMPACT_IMAGE
 from endo3d.services.archive.layout import ChunkIndex
 from endo3d.services.runtime.errors import UserError
 
@@ -59,6 +61,8 @@ class Stream:
     source: str
     """The service that wrote it, for topics written per service."""
     count: int
+    crop: Crop | None
+    """What was cut out of the camera's image."""
 
 
 class Record(NamedTuple):
@@ -73,10 +77,18 @@ class Record(NamedTuple):
     payload: memoryview
 
     def message(self) -> Message:
-        """Decoded; its arrays are views into the log. Raises ``codec.Malformed``."""
+        """Decoded; arrays are views into the log, unless packed or cropped. Raises ``codec.Malformed``."""
         if self.stream.topic is None:
             raise Unreadable(f"channel {self.stream.name} ({self.stream.schema}) is unknown to this version")
-        return codec.decode(self.stream.topic, self.payload)
+        payload = self.payload
+        if self.stream.schema == COMPACT_IMAGE.name:
+            from endo3d.services.archive.compact import unpack  # its kernels take a second to load
+
+            payload = unpack(payload)
+        message = codec.decode(self.stream.topic, payload)
+        if self.stream.crop is not None and isinstance(message, Frame):
+            return self.stream.crop.restore(message)
+        return message
 
 
 class Log:
@@ -247,7 +259,14 @@ def _stream_of(channel: Channel, schemas: Mapping[int, Schema], counts: Mapping[
     topic, source = topic_of(channel.topic)
     schema = schemas[channel.schema_id].name if channel.schema_id in schemas else ""
     return Stream(
-        channel.id, channel.topic, schema, channel.message_encoding, topic, source, counts.get(channel.id, 0)
+        id=channel.id,
+        name=channel.topic,
+        schema=schema,
+        encoding=channel.message_encoding,
+        topic=topic,
+        source=source,
+        count=counts.get(channel.id, 0),
+        crop=Crop.from_metadata(channel.metadata),
     )
 
 

@@ -112,7 +112,7 @@ class Recording:
 
 
 def _write(writer: Writer, entry: Entry) -> None:
-    channel = writer.channel(entry.channel, entry.kind)
+    channel = writer.channel(entry.channel, entry.kind, entry.metadata)
     writer.put(channel, entry.sequence, entry.log_ns, entry.publish_ns, *entry.payload)
 
 

@@ -191,7 +191,8 @@ def _write_anew(view: memoryview, path: Path, out: Path | None, inventory: _Inve
                     kinds[definition.id] = Kind(definition.name, definition.encoding, definition.data)
                 case Channel():
                     kind = kinds.get(definition.schema_id, Kind("", definition.message_encoding, b""))
-                    channels[definition.id] = writer.channel(definition.topic, kind)
+                    channel = writer.channel(definition.topic, kind, definition.metadata)
+                    channels[definition.id] = channel
                 case Attachment():
                     writer.attach(
                         definition.name, definition.media_type, definition.data, definition.log_time

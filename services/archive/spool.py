@@ -13,7 +13,6 @@ from pathlib import Path
 from queue import Empty, SimpleQueue
 
 from endo3d.services.archive.entry import Entry
-from endo3d.services.archive.layout import Buffer
 from endo3d.services.archive.recording import Recording
 from endo3d.services.archive.writer import OWN_CHUNK_BYTES
 
@@ -79,7 +78,7 @@ class Spool:
         self.trouble = ""
         """One line for people once recording has stopped by itself."""
         self._slots = Slots(queue_bytes)
-        self._queue: SimpleQueue[tuple[Entry, bytearray | None] | None] = SimpleQueue()
+        self._queue: SimpleQueue[tuple[Entry, bytearray] | None] = SimpleQueue()
         self._floor_bytes = floor_bytes
         self._transform = transform
         self._reserve = _reserve(recording.path, reserve_bytes)
@@ -91,39 +90,42 @@ class Spool:
         """Messages waiting to be written."""
         return self._queue.qsize()
 
-    def put(self, entry: Entry, valid: Callable[[], bool] = lambda: True) -> bool:
-        """Copy an entry's payload and queue it. False, and counted, when there is no room.
+    def put(
+        self,
+        entry: Entry,
+        size: int,
+        fill: Callable[[memoryview], object],
+        valid: Callable[[], bool] = lambda: True,
+    ) -> bool:
+        """Queue an entry whose payload of ``size`` bytes ``fill`` writes. False, and counted, without room.
 
-        ``valid`` is asked after the copy: False when the source was overwritten meanwhile.
+        ``valid`` is asked after the filling: False when its source was overwritten meanwhile.
         """
-        slot, payload = self._copy(entry)
-        if payload is None or not valid():
-            if slot is not None:
-                self._slots.give(slot)
-            self.dropped[entry.channel] += 1
-            return False
-        self._queue.put((replace(entry, payload=(payload,)), slot))
-        return True
+        memory = self._memory(size)
+        if memory is not None:
+            payload = memoryview(memory)[:size]
+            fill(payload)
+            if valid():
+                self._queue.put((replace(entry, payload=(payload,)), memory))
+                return True
+            self._give(memory)
+        self.dropped[entry.channel] += 1
+        return False
 
     def close(self) -> None:
         """Write what is queued and close the file; blocks until that is done."""
         self._queue.put(None)
         self._thread.join()
 
-    def _copy(self, entry: Entry) -> tuple[bytearray | None, Buffer | None]:
-        """The slot, if one was taken, and the payload in one piece; None when there is no room."""
-        size = sum(map(len, entry.payload))
+    def _memory(self, size: int) -> bytearray | None:
+        """Where a payload of ``size`` bytes waits; None when there is no room."""
         if self.trouble or self._queue.qsize() >= QUEUE_MESSAGES:
-            return None, None
-        if size < OWN_CHUNK_BYTES:
-            return None, b"".join(entry.payload)
-        if (slot := self._slots.take(size)) is None:
-            return None, None
-        at = 0
-        for part in entry.payload:
-            slot[at : at + len(part)] = part
-            at += len(part)
-        return slot, memoryview(slot)[:size]
+            return None
+        return bytearray(size) if size < OWN_CHUNK_BYTES else self._slots.take(size)
+
+    def _give(self, memory: bytearray) -> None:
+        if len(memory) >= OWN_CHUNK_BYTES:
+            self._slots.give(memory)
 
     def _run(self) -> None:
         flush_due = time.monotonic() + FLUSH_S
@@ -136,10 +138,9 @@ class Spool:
                 continue
             if item is None:
                 break
-            entry, slot = item
+            entry, memory = item
             self._guarded(self._write, entry)
-            if slot is not None:
-                self._slots.give(slot)
+            self._give(memory)
             if time.monotonic() >= flush_due:
                 self._guarded(self.recording.flush)
                 flush_due = time.monotonic() + FLUSH_S

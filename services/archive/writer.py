@@ -49,7 +49,7 @@ class Writer:
         self._small_entries: dict[int, list[tuple[int, int]]] = defaultdict(list)
         self._write(layout.MAGIC, record_bytes(Header(profile="", library=library)))
 
-    def channel(self, name: str, kind: Kind) -> int:
+    def channel(self, name: str, kind: Kind, metadata: Mapping[str, str] | None = None) -> int:
         """The id of a channel; its records are written when it is first asked for."""
         if (known := self._channels.get(name)) is not None:
             return known.id
@@ -62,7 +62,7 @@ class Writer:
             id=len(self._channels) + 1,
             topic=name,
             message_encoding=kind.encoding,
-            metadata={},
+            metadata=dict(metadata or {}),
             schema_id=schema.id,
         )
         self._write(*records, record_bytes(channel))
