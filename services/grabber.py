@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import ClassVar
 
 from pydantic import Field
@@ -41,7 +42,7 @@ class Grabber(Source[Config]):
 
     def open(self) -> None:
         try:
-            self.yaml = open(self.config.head, encoding="utf-8").read()
+            self.yaml = Path(self.config.head).read_text(encoding="utf-8")
             self.camera: Camera = open_camera(self.config.camera, Setting(self.config.rig, self.yaml))
         except OSError as error:
             raise UserError(
@@ -67,7 +68,7 @@ class Grabber(Source[Config]):
             self.announced = True
             yield from self.calibration()
         self.lend()
-        # In short turns: a mode that is announced meanwhile has to be known before its first shot is labelled.
+        # In short turns: a mode that is announced meanwhile must be known before its first shot is labelled.
         shot = self.camera.wait(min(timeout_s, TURN_S))
         if shot is not None:
             self.lent -= 1

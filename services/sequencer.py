@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from pathlib import Path
 from time import sleep
 from typing import Any, ClassVar
 
@@ -25,7 +26,7 @@ class Config(service.Config):
     rig: str = "demo"
     head: str = ""
     """Path of the sensor head's YAML."""
-    modes: dict[str, str] = {
+    modes: Mapping[str, str] = {
         "interleaved": "interleaved f1=25",
         "conventional": "conventional f=50/49/43 steps=4/2/2",
     }
@@ -46,7 +47,7 @@ class Sequencer(Source[Config]):
 
     def open(self) -> None:
         try:
-            yaml = open(self.config.head, encoding="utf-8").read()
+            yaml = Path(self.config.head).read_text(encoding="utf-8")
             self.sets = {name: patterns.parse(text) for name, text in self.config.modes.items()}
             self.projector: Projector = open_projector(self.config.projector, Setting(self.config.rig, yaml))
         except OSError as error:

@@ -1,4 +1,4 @@
-"""Which parts of the image formation are simulated: each can be switched off to show its share of the error."""
+"""Which parts of the image formation are simulated: each can be switched off, to show its share."""
 
 from __future__ import annotations
 

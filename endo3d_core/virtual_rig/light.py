@@ -19,7 +19,7 @@ class Light:
 
 
 def ideal(image: NDArray[np.uint8], gamma: float = 1.0) -> Light:
-    """A pattern image (rows, columns) as the DMD shows it, nothing in between; ``gamma`` is the projector's."""
+    """A pattern image (rows, columns) as the DMD shows it; ``gamma`` is the projector's."""
     per_px = np.array((1.0, 1.0, 0.0, 0.0), np.float32)
     if (image == image[:1]).all():
         image, per_px[1] = image[:1], 0.0

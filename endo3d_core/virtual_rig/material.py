@@ -82,7 +82,7 @@ def paint(
     z: NDArray[np.float32],
     out: NDArray[np.float32],
 ) -> None:
-    """Albedo times texture of the body ``index``, bilinear, where it is what a ray meets. ``T`` = T_body_camera."""
+    """Albedo times texture where a ray meets the body ``index``; ``T`` = T_body_camera."""
     size = np.float32(tile.shape[0])
     mask = np.uint32(tile.shape[0] - 1)
     flat = tile.reshape(-1)

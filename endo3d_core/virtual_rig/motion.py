@@ -12,8 +12,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from endo3d_core.rigid import rotation_exp
 from endo3d_core.virtual_rig.words import Words
 
 Pose = NDArray[np.float64]
@@ -49,7 +50,7 @@ def parse(text: str) -> Motion:
 
 
 class Hand:
-    """A hand that scans back and forth along x: 2..4 mm/s of drift, 8..12 Hz tremor of 50..100 um, small rotations."""
+    """A hand that scans back and forth along x: drift of 2..4 mm/s, tremor of 50..100 um, small rotations."""
 
     SETTLE_S = 1.0
     """Drift and tremor grow from rest within this time."""
@@ -83,22 +84,11 @@ class Hand:
         return transform(q[:3], q[3:])
 
 
-def transform(translation_mm: NDArray[np.float64], rotation_rad: NDArray[np.float64] | None = None) -> Pose:
-    """(4, 4) from a translation and a rotation vector (Rodrigues)."""
+def transform(translation_mm: ArrayLike, rotation_rad: ArrayLike = (0.0, 0.0, 0.0)) -> Pose:
+    """(4, 4) from a translation and a rotation vector."""
     T = np.eye(4)
-    T[:3, 3] = translation_mm
-    if rotation_rad is not None:
-        T[:3, :3] = rotation(rotation_rad)
+    T[:3, :3], T[:3, 3] = rotation_exp(rotation_rad), translation_mm
     return T
-
-
-def rotation(vector_rad: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Rodrigues' formula: (3,) -> (3, 3)."""
-    angle = float(np.linalg.norm(vector_rad))
-    x, y, z = vector_rad
-    K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    first, second = np.sinc(angle / math.pi), 0.5 * np.sinc(angle / (2 * math.pi)) ** 2
-    return np.asarray(np.eye(3) + first * K + second * K @ K)
 
 
 def _smooth(s: float) -> float:

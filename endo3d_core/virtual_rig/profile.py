@@ -1,8 +1,8 @@
 """Extruded scenes: a profile of straight lines and arcs in (x, z), constant along y.
 
-Every ray from one point of view crosses the profile's plane in a line through that point, so what the rays hit
-is a function of their slope dx/dz alone. ``seen_from`` computes that function once per view in closed form;
-casting a ray is then one look-up. z grows away from the sensor.
+Every ray from one point of view crosses the profile's plane in a line through that point, so what the rays
+hit is a function of their slope dx/dz alone. ``seen_from`` computes that function once per view in closed
+form; casting a ray is then one look-up. z grows away from the sensor.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ class Profile:
     """Primitives of one connected or loose contour."""
 
     primitives: NDArray[np.float64]
-    """(n, 6): LINE x0 z0 x1 z1 - ; ARC cx cz radius mid_angle half_angle (rad, of the centre's outward ray)."""
+    """(n, 6): LINE x0 z0 x1 z1 - ; ARC cx cz radius middle half (rad, seen from the centre)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +43,7 @@ class View:
 
 
 class Contour:
-    """Draws a profile from left to right, like a pen: lines, rounded corners, arcs. Heights point to the sensor."""
+    """Draws a profile from left to right: lines, rounded corners, arcs. Heights point to the sensor."""
 
     def __init__(self, x_mm: float, height_mm: float) -> None:
         self._corners: list[tuple[float, float, float]] = [(x_mm, height_mm, 0.0)]
@@ -155,7 +155,7 @@ def slope_range(primitive: NDArray[np.float64], ox: float, oz: float) -> tuple[f
 def hit(
     primitive: NDArray[np.float64], ox: float, oz: float, dx: float, dz: float
 ) -> tuple[float, float, float]:
-    """Where the ray (ox, oz) + s (dx, dz) first meets a primitive: s (infinite: never) and the facing normal."""
+    """Where the ray (ox, oz) + s (dx, dz) first meets a primitive: s (or infinity), the facing normal."""
     if primitive[0] == LINE:
         ax, az = primitive[1] - ox, primitive[2] - oz
         ex, ez = primitive[3] - primitive[1], primitive[4] - primitive[2]
@@ -193,7 +193,7 @@ def cast_exact(
     ry: NDArray[np.float64],
     z: NDArray[np.float64],
 ) -> None:
-    """Lower ``z`` (n,) float64 to the depth at which rays (rx, ry, 1) meet the profile; ``T`` = T_body_camera."""
+    """Lower ``z`` (n,) to the depths at which rays (rx, ry, 1) meet the profile; ``T`` = T_body_camera."""
     for i in range(rx.size):
         dx = T[0, 0] * rx[i] + T[0, 1] * ry[i] + T[0, 2]
         dz = T[2, 0] * rx[i] + T[2, 1] * ry[i] + T[2, 2]
@@ -254,7 +254,7 @@ def shadow(
     z: NDArray[np.float32],
     lit: NDArray[np.float32],
 ) -> None:
-    """Clear ``lit`` (n,) where the projector at (px, pz) of the body's axes sees something nearer on the way."""
+    """Clear ``lit`` (n,) where the projector at (px, pz) of the body's axes sees something nearer."""
     last = np.float32(advance.size - 2)
     zero = np.float32(0.0)
     for i in range(rx.size):
@@ -263,6 +263,6 @@ def shadow(
         position = min(max((x / h - first) * per_unit, zero), last)
         j = np.uint32(position)
         f = position - np.float32(j)
-        # The nearest of both neighbours and the interpolation: a silhouette's step must not shadow its own edge.
+        # The farther of both neighbours: a silhouette's step must not shadow its own edge.
         s = max(advance[j], advance[j + np.uint32(1)]) if f > zero else advance[j]
         lit[i] = lit[i] if h <= s + bias else zero

@@ -10,12 +10,13 @@ from numpy.typing import NDArray
 from endo3d_core.calibration import Lens, Rig
 from endo3d_core.head import Head
 from endo3d_core.virtual_rig import material, sensor, shading
+from endo3d_core.virtual_rig.casting import Chunk, Field, Sight, sight
 from endo3d_core.virtual_rig.effects import FULL, Effects
 from endo3d_core.virtual_rig.light import Light
 from endo3d_core.virtual_rig.profile import FAR_MM
 from endo3d_core.virtual_rig.scene import Scene
 from endo3d_core.virtual_rig.sensor import Sensor
-from endo3d_core.virtual_rig.sights import Chunk, Field, Sight, sight
+from endo3d_core.virtual_rig.truth import inside
 
 CHUNK = 24_576
 """Rays at a time: their arrays stay in a core's second-level cache."""
@@ -39,9 +40,9 @@ class Renderer:
     ) -> None:
         self.rig, self.head, self.scene, self.effects = rig, head, scene, effects
         self.camera = rig.camera.binned(bin_px) if bin_px > 1 else rig.camera
-        self.sensor = optics or Sensor()
+        self.sensor = optics or Sensor(bits=8 if effects.quantisation else 16)
         self.circle_px = head.camera_circle_px / bin_px
-        where = np.flatnonzero(_inside(self.camera, self.circle_px))
+        where = np.flatnonzero(inside(self.camera, self.camera.pixel_grid(), self.circle_px))
         self.where = where.astype(np.uint32)
         pixels = np.stack((where % self.camera.width, where // self.camera.width), axis=-1)
         rays = self.camera.undistort(pixels)
@@ -122,27 +123,10 @@ class Renderer:
         out: NDArray[np.uint8] | NDArray[np.uint16],
     ) -> None:
         """Render into ``out`` (height, width); ``number`` seeds the frame's noise."""
-        self._develop(self.radiance(light, T_scene_camera), exposure_us, number, out)
-
-    def _develop(
-        self, radiance: NDArray[np.float32], exposure_us: float, number: int, out: NDArray[np.generic]
-    ) -> None:
-        s, noisy = self.sensor, self.effects.noise
-        electrons = self.gain * np.float32(s.flux_e_per_ms * exposure_us * 1e-3)
+        electrons = self.radiance(light, T_scene_camera)
+        electrons *= self.gain * np.float32(self.sensor.flux_e_per_ms * exposure_us * 1e-3)
         out.fill(0)
-        seed = np.uint32((number * 2_654_435_761 + 0x9E3779B9) & 0xFFFF_FFFF)
-        sensor.expose(
-            radiance, electrons, self.where, seed, np.float32(s.read_noise_e**2 if noisy else 0.0),
-            np.float32(noisy), np.float32(s.full_well_e), np.float32(1.0 / s.electrons_per_grey),
-            np.float32(1.0), sensor.quantiles(), out.reshape(-1),
-        )  # fmt: skip
-
-
-def _inside(lens: Lens, circle_px: float) -> NDArray[np.bool_]:
-    """(height, width) pixels on which the fibre is imaged: a circle about the image's middle."""
-    u = np.arange(lens.width) - (lens.width - 1) / 2
-    v = np.arange(lens.height) - (lens.height - 1) / 2
-    return np.asarray(u[None, :] ** 2 + v[:, None] ** 2 <= (circle_px / 2) ** 2)
+        sensor.develop(self.sensor, electrons, self.where, number, self.effects.noise, out)
 
 
 def _circle(lens: Lens, circle_px: float) -> NDArray[np.float64]:

@@ -7,9 +7,9 @@
     contour                             the micro-contour standard of the paper
     sphere r=1 at=0,0,19 + plane z=20
 
-Of every body: ``at=x,y,z`` (mm, in the camera's axes at time 0; z defaults to the working distance), ``turn=a,b,c``
-(rotation vector, deg), ``albedo=0.7``, ``texture=noise:0.15`` or ``noise:0.15:0.06`` (contrast, size in mm),
-``texture=checker:0.5:1``, ``surface=metal``, ``specular=``, ``gloss=``.
+Of every body: ``at=x,y,z`` (mm, in the camera's axes at time 0; z defaults to the working distance),
+``turn=a,b,c`` (rotation vector, deg), ``albedo=0.7``, ``texture=noise:0.15`` or ``noise:0.15:0.06``
+(contrast, size in mm), ``texture=checker:0.5:1``, ``surface=metal``, ``specular=``, ``gloss=``.
 """
 
 from __future__ import annotations

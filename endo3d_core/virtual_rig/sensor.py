@@ -19,13 +19,13 @@ class Sensor:
     full_well_e: float = 32_000.0
     read_noise_e: float = 7.0
     bits: int = 8
-    """8 or 12."""
+    """8, 12, or 16 for steps too fine to matter."""
     flux_e_per_ms: float = 4_000.0
     """Of a white diffuse surface, upright, fully lit, at the working distance, in the middle of the field."""
 
     @property
     def electrons_per_grey(self) -> float:
-        return self.full_well_e / (2**self.bits - 1)
+        return self.full_well_e / float(2**self.bits - 1)
 
     @property
     def dtype(self) -> type[np.uint8] | type[np.uint16]:
@@ -44,9 +44,34 @@ def quantiles() -> NDArray[np.float32]:
     return np.asarray(q / q.std() / math.sqrt(2.0), np.float32)
 
 
+def develop(
+    sensor: Sensor,
+    electrons: NDArray[np.float32],
+    where: NDArray[np.uint32],
+    number: int,
+    noise: bool,
+    out: NDArray[np.uint8] | NDArray[np.uint16],
+) -> None:
+    """Grey values of n pixels with these mean ``electrons`` into the image ``out`` at flat index ``where``.
+
+    ``number`` seeds the noise: equal numbers give equal frames.
+    """
+    seed = np.uint32((number * 2_654_435_761 + 0x9E3779B9) & 0xFFFF_FFFF)
+    _expose(
+        electrons,
+        where,
+        seed,
+        np.float32(sensor.read_noise_e**2 if noise else 0.0),
+        np.float32(noise),
+        np.float32(sensor.full_well_e),
+        np.float32(1.0 / sensor.electrons_per_grey),
+        quantiles(),
+        out.reshape(-1),
+    )
+
+
 @kernel
-def expose(
-    radiance: NDArray[np.float32],
+def _expose(
     electrons: NDArray[np.float32],
     where: NDArray[np.uint32],
     seed: np.uint32,
@@ -54,19 +79,16 @@ def expose(
     shot: np.float32,
     full_well: np.float32,
     per_electron: np.float32,
-    rounding: np.float32,
     normal: NDArray[np.float32],
     out: NDArray[np.generic],
 ) -> None:
-    """Grey values of n pixels into ``out`` (flat image) at ``where`` (n,).
+    """Above some ten electrons a Poisson number is a normal one to within Mono8's step of 125.
 
-    ``electrons`` (n,): of radiance 1; the mean's shot noise is switched by ``shot`` (1 or 0), ``noise_e2`` is the
-    read noise squared. Above some ten electrons a Poisson number is a normal one to within the quantisation of
-    Mono8 (125 electrons).
+    ``shot`` (1 or 0) switches the shot noise, ``noise_e2`` is the read noise squared.
     """
     zero, half = np.float32(0.0), np.float32(0.5)
     low, shift = np.uint32(QUANTILES - 1), np.uint32(16)
-    for i in range(radiance.size):
+    for i in range(electrons.size):
         # lowbias32, a bijective hash of the counter: white over pixels and, through the seed, over frames.
         x = np.uint32(where[i] ^ seed)
         x = np.uint32(x ^ (x >> np.uint32(16)))
@@ -74,8 +96,8 @@ def expose(
         x = np.uint32(x ^ (x >> np.uint32(15)))
         x = np.uint32(x * np.uint32(0x846CA68B))
         x = np.uint32(x ^ (x >> np.uint32(16)))
-        mean = radiance[i] * electrons[i]
+        mean = electrons[i]
         deviate = normal[x & low] + normal[(x >> shift) & low]
         e = mean + deviate * np.float32(math.sqrt(shot * max(mean, zero) + noise_e2))
         e = min(max(e, zero), full_well)
-        out[where[i]] = np.uint16(e * per_electron + rounding * half)
+        out[where[i]] = np.uint16(e * per_electron + half)

@@ -26,8 +26,8 @@ def to_projector(
 ) -> None:
     """Projector pixel (u, v) and depth along the projector's axis of the points z (rx, ry, 1).
 
-    ``lens``: fx, skew, cx, fy, cy, k1, k2, p1, p2, k3; ``circle``: what the projector's fibre sees of the pattern
-    (centre u, v, squared radius), ``lit`` is cleared outside.
+    ``lens``: fx, skew, cx, fy, cy, k1, k2, p1, p2, k3; ``circle``: what the projector's fibre sees of the
+    pattern (centre u, v, squared radius), ``lit`` is cleared outside.
     """
     fx, skew, cx, fy, cy = lens[0], lens[1], lens[2], lens[3], lens[4]
     k1, k2, p1, p2, k3 = lens[5], lens[6], lens[7], lens[8], lens[9]
@@ -58,8 +58,8 @@ def sample(
 ) -> None:
     """Bilinear look-up in a (rows, columns) light at projector pixels; the edge continues outwards.
 
-    ``per_px``: samples per projector pixel along u and v, and the sample index of pixel 0 (u, v); a light that
-    does not vary along an axis has one sample there and 0 per pixel.
+    ``per_px``: samples per projector pixel along u and v, and the sample index of pixel 0 (u, v); a light
+    that does not vary along an axis has one sample there and 0 per pixel.
     """
     flat = light.reshape(-1)
     width = np.uint32(light.shape[1])
@@ -100,7 +100,7 @@ def reflect(
     index: np.uint8,
     out: NDArray[np.float32],
 ) -> None:
-    """Radiance towards the camera, 1 = a white diffuse surface, upright and fully lit at the working distance.
+    """Radiance towards the camera; 1: a white diffuse surface, upright, fully lit, at the working distance.
 
     ``centre``, ``axis``: of the projector in the camera's axes; ``unit2``: the squared distance at which the
     irradiance is 1; ``ambient``: a share of that, from everywhere.

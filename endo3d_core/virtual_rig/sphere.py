@@ -38,9 +38,7 @@ def cast_exact(
 
 @kernel
 def cast(
-    cx: np.float32,
-    cy: np.float32,
-    cz: np.float32,
+    centre: NDArray[np.float32],
     radius: np.float32,
     rx: NDArray[np.float32],
     ry: NDArray[np.float32],
@@ -51,12 +49,13 @@ def cast(
     body: NDArray[np.uint8],
     index: np.uint8,
 ) -> None:
-    """Where the sphere about (cx, cy, cz) of the camera's axes is nearer than ``z`` (n,), set depth, normal, body.
+    """Where the sphere about ``centre`` (camera's axes) is nearer than ``z`` (n,): depth, normal, body.
 
     The root is taken of the squared distance between ray and centre, which float32 can hold; the textbook's
     discriminant b^2 - ac loses micrometres here.
     """
     one, zero = np.float32(1.0), np.float32(0.0)
+    cx, cy, cz = centre[0], centre[1], centre[2]
     r2, inverse = radius * radius, one / radius
     for i in range(rx.size):
         a = rx[i] * rx[i] + ry[i] * ry[i] + one
@@ -74,20 +73,18 @@ def cast(
 
 @kernel
 def shadow(
-    cx: np.float32,
-    cy: np.float32,
-    cz: np.float32,
+    centre: NDArray[np.float32],
     radius: np.float32,
-    px: np.float32,
-    py: np.float32,
-    pz: np.float32,
+    lamp: NDArray[np.float32],
     bias: np.float32,
     rx: NDArray[np.float32],
     ry: NDArray[np.float32],
     z: NDArray[np.float32],
     lit: NDArray[np.float32],
 ) -> None:
-    """Clear ``lit`` (n,) where the sphere stands between the point seen and the projector at (px, py, pz)."""
+    """Clear ``lit`` (n,) where the sphere stands between the point seen and the projector (``lamp``)."""
+    cx, cy, cz = centre[0], centre[1], centre[2]
+    px, py, pz = lamp[0], lamp[1], lamp[2]
     one, zero = np.float32(1.0), np.float32(0.0)
     limit = (radius - bias) * (radius - bias)
     for i in range(rx.size):

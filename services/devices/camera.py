@@ -44,7 +44,7 @@ class Camera(Protocol):
         """Give the camera an array of ``shape`` and ``dtype`` to fill; it comes back in a ``Shot``."""
 
     def wait(self, timeout_s: float) -> Shot | None:
-        """The next shot, or None when there was none in time. Raises ``DeviceError`` when the camera is gone."""
+        """The next shot; None when there was none in time. Raises ``DeviceError`` when the camera is gone."""
 
     def set_exposure(self, exposure_us: float) -> None:
         """The longest the projector shows a pattern: the camera integrates all of it."""

@@ -2,7 +2,8 @@
 
 The body is a scene's text (``contour texture=noise:0.15``). Options: ``motion`` (``hand seed=7``), ``preset``
 (fast, full, ideal), ``bin`` (pixels per pixel, 2 gives 960x600), ``slow_motion`` (seconds of wall time per
-simulated second: exposures and motion are those of the simulated time), ``seed`` of the noise, ``bench`` (path).
+simulated second: exposures and motion are those of the simulated time), ``seed`` of the noise, ``bench``
+(path).
 """
 
 from __future__ import annotations
@@ -51,7 +52,7 @@ def open_uri(uri: Uri, setting: Setting) -> SimCamera:
 
 
 class SimCamera:
-    """Triggered by the bench's light; a trigger that comes while it is busy makes no frame, as on a real one."""
+    """Triggered by the bench's light; as on a real one, a trigger while it is busy makes no frame."""
 
     def __init__(
         self, bench: Bench, renderer: Renderer, motion: Motion, slow_motion: float, seed: int

@@ -7,6 +7,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from endo3d.services.devices.bench import Bench, dark, default_path
 from endo3d.services.devices.projector import Limits, ProjectorStatus
 from endo3d.services.devices.uri import DeviceError, Setting, Uri
@@ -35,7 +38,8 @@ class SimProjector:
         self._places: dict[str, tuple[int, ...]] = {}
 
     def load(self, sets: Sequence[PatternSet]) -> None:
-        images, self._places = [], {}
+        self._places = {}
+        images: list[NDArray[np.uint8]] = []
         seen: dict[tuple[float, float, str, str, float], int] = {}
         for pattern_set in sets:
             places = []
@@ -57,7 +61,7 @@ class SimProjector:
         exposures = tuple(p.exposure_us or exposure_us for p in pattern_set.patterns)
         if min(exposures) < self.limits.min_exposure_us or dark_us < self.limits.min_dark_us:
             raise DeviceError(
-                f"exposure {min(exposures):g} us and dark time {dark_us:g} us are too short; the projector needs "
+                f"exposure {min(exposures):g} us and dark {dark_us:g} us are too short; the projector needs "
                 f"{self.limits.min_exposure_us:g} and {self.limits.min_dark_us:g} us"
             )
         before = self._bench.read()
@@ -71,7 +75,7 @@ class SimProjector:
                 exposures_us=exposures,
                 images=places,
                 begun_ns=before.begun_ns or start_ns,
-            )  # fmt: skip
+            )
         )
         return start_ns
 

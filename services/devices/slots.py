@@ -30,7 +30,7 @@ class Timeline:
         return self.start_ns + cycle * int(self.offsets_ns[-1]) + int(self.offsets_ns[slot])
 
     def nearest(self, stamp_ns: int) -> tuple[int, int, int]:
-        """The pattern whose exposure begins nearest to a stamp: its count, how late the stamp is, its period, ns."""
+        """The pattern whose exposure begins nearest to a stamp: count, how late the stamp is, period (ns)."""
         cycle, rest = divmod(stamp_ns - self.start_ns, int(self.offsets_ns[-1]))
         slot = int(np.argmin(np.abs(self.offsets_ns - rest)))
         inside = min(slot, self.slots - 1)

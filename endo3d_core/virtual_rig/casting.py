@@ -1,4 +1,4 @@
-"""A shape seen from one pose of the head: prepared once per pose, cast chunk by chunk."""
+"""Rays meet shapes: fast for images (prepared once per pose, chunk by chunk), exact for the truth."""
 
 from __future__ import annotations
 
@@ -62,6 +62,22 @@ def sight(shape: Shape, T_body_camera: NDArray[np.float64], field: Field) -> Sig
             return SphereSight(shape, T_body_camera, field)
 
 
+def cast_exact(
+    shape: Shape,
+    T_body_view: NDArray[np.float64],
+    rx: NDArray[np.float64],
+    ry: NDArray[np.float64],
+    z: NDArray[np.float64],
+) -> None:
+    """Lower ``z`` (n,) to the depths at which the rays (rx, ry, 1) of a view meet the shape."""
+    T = np.ascontiguousarray(T_body_view)
+    match shape:
+        case Profile():
+            profile.cast_exact(shape.primitives, T, rx, ry, z)
+        case Sphere():
+            sphere.cast_exact(shape.radius_mm, T, rx, ry, z)
+
+
 class ProfileSight:
     def __init__(self, shape: Profile, T: NDArray[np.float64], field: Field) -> None:
         self.T = T.astype(np.float32)
@@ -101,8 +117,8 @@ class SphereSight:
 
     def cast(self, chunk: Chunk, index: np.uint8) -> None:
         c = chunk
-        sphere.cast(*self.centre, self.radius, c.rx, c.ry, c.z, c.nx, c.ny, c.nz, c.body, index)
+        sphere.cast(self.centre, self.radius, c.rx, c.ry, c.z, c.nx, c.ny, c.nz, c.body, index)
 
     def shadow(self, chunk: Chunk) -> None:
         c = chunk
-        sphere.shadow(*self.centre, self.radius, *self.lamp, BIAS_MM, c.rx, c.ry, c.z, c.lit)
+        sphere.shadow(self.centre, self.radius, self.lamp, BIAS_MM, c.rx, c.ry, c.z, c.lit)
