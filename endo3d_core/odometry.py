@@ -101,11 +101,13 @@ class Odometry:
         T = predicted
         rows = self.map.touched
         photometric = True
+        # The first iteration has to take in what the prediction missed; then the residuals set the scales.
         gate_mm = 8.0 * self._scale_mm + view.pitch_mm
+        scale_mm, texture_scale = 0.5 * gate_mm, 4.0 * self._texture_scale
         for _ in range(ITERATIONS):
             n = self._equations.at(
                 T, self.map, rows, view.live, view.coefficients, centre=centre, radius_mm=radius_mm, gate_mm=gate_mm,
-                scale_mm=self._scale_mm, texture_scale=self._texture_scale,
+                scale_mm=scale_mm, texture_scale=texture_scale,
                 texture_sigma=view.texture_sigma, normal_sigma=view.normal_sigma(),
                 photometric=photometric,
             )  # fmt: skip
@@ -113,10 +115,10 @@ class Odometry:
                 break
             solution = health.solve(n, sigma_mm)
             T = T @ health.motion(solution.step, centre, radius_mm)
-            self._scale_mm = float(np.clip(n.residual_mm, sigma_mm, 4.0 * sigma_mm))
+            scale_mm = max(n.residual_mm, sigma_mm)
             if n.textured:
-                self._texture_scale = float(np.clip(n.texture_residual, 1e-4, 0.3))
-            gate_mm = 8.0 * self._scale_mm
+                texture_scale = max(n.texture_residual, view.texture_sigma)
+            gate_mm = 8.0 * scale_mm
             if np.linalg.norm(solution.step) < _CONVERGED * sigma_mm:
                 break
         share = n.used / max(n.visible, 1)
@@ -125,6 +127,7 @@ class Odometry:
                 self.T_world_camera, np.zeros((6, 6)), State.LOST, np.inf, np.zeros(6), share, n.residual_mm, 0.0,
                 self.submap,
             )  # fmt: skip
+        self._scale_mm, self._texture_scale = min(scale_mm, 4.0 * sigma_mm), texture_scale
         T = rigid.orthonormal(T)
         self._advance(T, stamp_ns, solution.held, centre, radius_mm)
         return Estimate(

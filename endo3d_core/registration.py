@@ -106,7 +106,7 @@ class Linearisation:
             self._sums, self._gradients, self._moments, self._statistics,
         )  # fmt: skip
         for block in self._sums:
-            block += np.tril(block.T, -1)
+            block += np.triu(block.T, 1)
         s = self._statistics
         geometry, texture, texture_noise = self._sums[0].copy(), self._sums[1].copy(), TEXTURE_SLOPE_VARIANCE * texture_sigma**2 * self._sums[2]
         mean_noise = self._moments[0] / max(np.trace(geometry[:3, :3]), 1e-300)
@@ -221,10 +221,17 @@ def _accumulate(  # type: ignore[no-untyped-def]
         moments[9] += tilt * sy * sz
         if not (photometric and facing >= f(FACING) and q[7] + q[8] == q[7] + q[8]):
             continue
-        # The live texture where the map point falls, to first order in the two slopes.
-        qa, qb = q[0] / q[2], q[1] / q[2]
+        # The live texture where the map point falls: bilinear, from the offset to this cell's own ray. (The
+        # slopes are too smooth for it: they would pull towards whole cells.)
         fx, fy = c1 + c3 * (three * a * a + b * b), d2 + d4 * (a * a + three * b * b)
-        difference = q[6] + q[7] * fx * (a - qa) + q[8] * fy * (b - qb) - m[TEXTURE]
+        du, dv = fx * (a - q[0] / q[2]), fy * (b - q[1] / q[2])
+        aside, below = column + (1 if du > f(0.0) else -1), row + (1 if dv > f(0.0) else -1)
+        du, dv = abs(du), abs(dv)
+        here = (one - du) * q[6] + du * live[row, aside, 6]
+        there = (one - du) * live[below, column, 6] + du * live[below, aside, 6]
+        difference = (one - dv) * here + dv * there - m[TEXTURE]
+        if not abs(difference) < f(1.0):
+            continue
         # A camera motion moves the map point by minus itself in camera axes.
         per_z = one / z
         hx, hy = x - gx, y - gy
