@@ -48,10 +48,10 @@ frame.image, frame.slot, frame.stamp_ns
 ```
 
 Without it, with any protobuf library in any language: what can be shown is one of Foxglove's messages. What
-Foxglove's lack travels in the same message as field {LABEL}, `label`; field {PADDING} is padding that aligns the
-array. Stock readers (Foxglove, Rerun, `foxglove-schemas-protobuf`) skip both. An MCAP log carries the complete
-descriptors, so a reader that builds its classes from the log (here: `pip install mcap-protobuf-support`) sees
-the labels as well:
+Foxglove's lack travels in the same message as field {LABEL}, `label`; field {PADDING} is padding that aligns
+the array. Stock readers (Foxglove, Rerun, `foxglove-schemas-protobuf`) skip both. An MCAP log carries the
+complete descriptors, so a reader that builds its classes from the log sees the labels as well (here with
+`pip install mcap-protobuf-support`):
 
 ```python
 from mcap.reader import make_reader
@@ -62,13 +62,13 @@ for schema, channel, record, proto in reader.iter_decoded_messages(topics=["/fra
     print(proto.width, proto.height, proto.label.slot)
 ```
 
-The array of a bulk message stands last, at byte {codec.DATA_OFFSET}, written in place. Any other writer may put
-it anywhere and leave the label out: it is read with slot -1, zero counts and NaN figures.
+The array of a bulk message stands last, at byte {codec.DATA_OFFSET}, written in place. Any other writer may
+put it anywhere and leave the label out: it is read with slot -1, zero counts and NaN figures.
 
 ## Topics
 
-The key on the bus is `endo3d/<rig>/<topic>`, and the channel in a log `/<topic>`; a topic marked "per service"
-has the service's name appended to both.
+The key on the bus is `endo3d/<rig>/<topic>`, and the channel in a log `/<topic>`; a topic marked "per
+service" has the service's name appended to both.
 """
 
 
