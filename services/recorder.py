@@ -164,7 +164,7 @@ class Recorder(Tap[RecorderConfig]):
             kind=self._kinds[sample.topic.name],
             sequence=getattr(message, "sequence", 0),
             log_ns=sample.received_ns,
-            publish_ns=message.stamp_ns,
+            publish_ns=max(0, message.stamp_ns),  # the format knows no time before 1970
             payload=(sample.payload,),
             latched=sample.topic.latched,
             attachment=attachment,

@@ -18,7 +18,7 @@ NS_PER_S = 1_000_000_000
 class Recording:
     """Splits by size or time; every part repeats facts, attachments and the last latched messages.
 
-    Not thread-safe. After an ``OSError`` of ``put`` or ``flush``: ``rescue``, which closes what is whole.
+    Not thread-safe. After an ``OSError`` of ``put`` or ``flush``: ``abandon_tail``, then ``finish``.
     """
 
     def __init__(
@@ -69,15 +69,19 @@ class Recording:
     def finish(self) -> None:
         """Close the open part; a recording without any message leaves no file."""
         if (writer := self._writer) is not None:
-            self._writer = None
             writer.finish()
+            self._writer = None
             self._finished_bytes += writer.size
 
-    def rescue(self) -> None:
-        """After a failed write: cut the torn record off and close."""
-        if self._writer is not None:
-            self._writer.abandon_tail()
-            self.finish()
+    def leave_torn(self) -> None:
+        """Close the open part without its index, when even that can't be written."""
+        if (writer := self._writer) is not None:
+            self._writer = None
+            writer.leave_torn()
+
+    def abandon_tail(self) -> Mapping[str, int]:
+        """After a failed write: cut the torn record off; returns the small messages lost, per channel."""
+        return self._writer.abandon_tail() if self._writer is not None else {}
 
     def _part_for(self, entry: Entry) -> Writer:
         writer = self._writer

@@ -139,8 +139,10 @@ class Spool:
             if item is None:
                 break
             entry, memory = item
-            self._guarded(self._write, entry)
+            if not self._guarded(self._write, entry):
+                self.dropped[entry.channel] += 1
             self._give(memory)
+            self._guarded(self._look_at_disk)
             if time.monotonic() >= flush_due:
                 self._guarded(self.recording.flush)
                 flush_due = time.monotonic() + FLUSH_S
@@ -151,26 +153,34 @@ class Spool:
     def _write(self, entry: Entry) -> None:
         if self.trouble:
             self.dropped[entry.channel] += 1
-            return
-        self.recording.put(self._transform(entry))
-        if self._floor_bytes and (free := _free_bytes(self.recording.path.parent)) < self._floor_bytes:
+        else:
+            self.recording.put(self._transform(entry))
+
+    def _look_at_disk(self) -> None:
+        free_bytes = _free_bytes(self.recording.path.parent)
+        if free_bytes < self._floor_bytes and not self.trouble:
             self._stop(
-                f"disk nearly full ({free >> 20} MB left): recording closed; make room and start again"
+                f"only {free_bytes >> 20} MB left on the disk: recording closed; make room, start again"
             )
             self.recording.finish()
 
-    def _guarded(self, write: Callable[..., None], *arguments: Entry) -> None:
+    def _guarded(self, write: Callable[..., None], *arguments: Entry) -> bool:
         """A failed write ends the recording, not the thread: the queue is emptied and drops are counted."""
         try:
             write(*arguments)
-        except OSError as error:
+            return True
+        except Exception as error:  # whatever it is, the pipeline goes on and the status says it
             if self._reserve is not None:
                 self._reserve.unlink(missing_ok=True)
-            self._stop(f"{error.strerror}: recording closed; make room and start again")
+            what = error.strerror if isinstance(error, OSError) else f"{type(error).__name__}: {error}"
+            self._stop(f"{what}: recording closed; make room on the disk and start again")
             try:
-                self.recording.rescue()
+                self.dropped.update(self.recording.abandon_tail())
+                self.recording.finish()
             except OSError as second:
+                self.recording.leave_torn()
                 self._stop(f"{second.strerror}: no index; endo3d recover {self.recording.parts[-1]}")
+            return False
 
     def _stop(self, why: str) -> None:
         self.trouble = why

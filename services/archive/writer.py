@@ -34,7 +34,7 @@ class Kind(NamedTuple):
 
 
 class Writer:
-    """One MCAP file. Not thread-safe; after an ``OSError``: ``abandon_tail``, then ``finish``."""
+    """One MCAP file. Not thread-safe. After an ``OSError``: ``abandon_tail``, then ``finish`` or ``leave_torn``."""
 
     def __init__(self, sink: Sink, library: str) -> None:
         self._sink = sink
@@ -80,11 +80,11 @@ class Writer:
         if size >= OWN_CHUNK_BYTES:
             self._chunk((head, *payload), {channel: [(log_ns, 0)]})
             return
+        if self.buffered + size >= SMALL_CHUNK_BYTES:
+            self.flush()
         self._small_entries[channel].append((log_ns, self.buffered))
         self._small += head, *map(bytes, payload)
         self.buffered += len(head) + size
-        if self.buffered >= SMALL_CHUNK_BYTES:
-            self.flush()
 
     def flush(self) -> None:
         """Write the small messages gathered so far, as one chunk."""
@@ -118,16 +118,21 @@ class Writer:
 
     def finish(self) -> None:
         """Flush, write the summary and close."""
-        try:
-            self.flush()
-            self._write(self._summary.pack(self.size))
-        finally:
-            self._sink.close()
+        self.flush()
+        self._write(self._summary.pack(self.size))
+        self._sink.close()
 
-    def abandon_tail(self) -> None:
-        """Cut the file back to its last whole record, and forget the small messages gathered since."""
+    def leave_torn(self) -> None:
+        """Close without an index: the disk takes nothing more."""
+        self._sink.close()
+
+    def abandon_tail(self) -> Mapping[str, int]:
+        """Cut the file back to its last whole record; returns the small messages lost, per channel."""
+        names = {channel.id: name for name, channel in self._channels.items()}
+        lost = {names[channel]: len(items) for channel, items in self._small_entries.items()}
         self._forget_small()
         self._sink.truncate(self.size)
+        return lost
 
     def _chunk(self, records: tuple[Buffer, ...], entries: Entries) -> None:
         stamps = [stamp for items in entries.values() for stamp, _ in items]
