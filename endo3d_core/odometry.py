@@ -21,8 +21,8 @@ _CONVERGED = 0.02
 _LEAST_SHARE = 0.35
 """Of the visible map points that must agree with the cloud."""
 _LEAST_POINTS = 300
-_LONGEST_GAP_NS = 50_000_000
-"""After a longer gap the last velocity says nothing about a hand."""
+_LONGEST_GAP = 6.0
+"""After a gap of more than so many periods the last velocity says nothing about a hand."""
 
 
 class State(StrEnum):
@@ -64,14 +64,17 @@ class Odometry:
         self.T_world_camera = np.eye(4)
         self._velocity = np.zeros(6)
         self._last_ns: int | None = None
-        self._step_ns = 1
+        self._period_ns = 0
         self._scale_mm = np.nan
         self._texture_scale = 0.1
         self.submap = 0
 
     def track(self, channels: NDArray[np.float32], sequence: int, stamp_ns: int) -> Estimate:
         """One cloud (height, width, 6) float32: x y z mm, intensity, quality, sigma mm."""
-        self.view.load(channels)
+        try:
+            self.view.load(channels)
+        except ValueError:
+            return self._lost(0.0, np.nan)
         if self._last_ns is None:
             return self._begin(sequence, stamp_ns)
         predicted = self._predict(stamp_ns)
@@ -91,7 +94,7 @@ class Odometry:
     def _predict(self, stamp_ns: int) -> Array:
         assert self._last_ns is not None
         gap_ns = stamp_ns - self._last_ns
-        if not 0 < gap_ns <= _LONGEST_GAP_NS:
+        if not 0 < gap_ns <= _LONGEST_GAP * self._period_ns:
             return self.T_world_camera
         return self.T_world_camera @ rigid.exp(self._velocity * gap_ns)
 
@@ -123,10 +126,7 @@ class Odometry:
                 break
         share = n.used / max(n.visible, 1)
         if n.used < _LEAST_POINTS or share < _LEAST_SHARE:
-            return Estimate(
-                self.T_world_camera, np.zeros((6, 6)), State.LOST, np.inf, np.zeros(6), share, n.residual_mm, 0.0,
-                self.submap,
-            )  # fmt: skip
+            return self._lost(share, n.residual_mm)
         self._scale_mm, self._texture_scale = min(scale_mm, 4.0 * sigma_mm), texture_scale
         T = rigid.orthonormal(T)
         self._advance(T, stamp_ns, solution.held, centre, radius_mm)
@@ -142,10 +142,17 @@ class Odometry:
             submap=self.submap,
         )
 
+    def _lost(self, share: float, residual_mm: float) -> Estimate:
+        """The last pose, and no information."""
+        return Estimate(
+            self.T_world_camera, np.zeros((6, 6)), State.LOST, np.inf, np.zeros(6), share, residual_mm, 0.0, self.submap
+        )
+
     def _advance(self, T: Array, stamp_ns: int, held: Array, centre: Array, radius_mm: float) -> None:
         """The new pose, and the velocity for the next prediction: none along held directions."""
         assert self._last_ns is not None
         moved = health.scaled_twist(rigid.inverse(self.T_world_camera) @ T, centre, radius_mm)
         moved -= held @ (held.T @ moved)
-        self._velocity = rigid.log(health.motion(moved, centre, radius_mm)) / max(stamp_ns - self._last_ns, 1)
+        self._period_ns = max(stamp_ns - self._last_ns, 1)
+        self._velocity = rigid.log(health.motion(moved, centre, radius_mm)) / self._period_ns
         self.T_world_camera, self._last_ns = T, stamp_ns

@@ -1,0 +1,131 @@
+"""Clouds in; the tip's pose, its health and the merged map out, at camera rate."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+from pydantic import Field
+
+from endo3d.schemas import topics
+from endo3d.schemas.messages import Cloud, MapDelta, Message, Pose, ProjectorCalibration, Tracking, Transform
+from endo3d.services.runtime.service import Config, Refused, Service
+from endo3d_core import merging, odometry, rigid
+
+
+class OdometryConfig(Config):
+    merging_distance_um: float = Field(75.0, ge=10.0, le=1000.0)
+    """Points nearer than this become one (section 3.3); it limits the lateral resolution."""
+    map_limit: int = Field(1_000_000, ge=10_000)
+    """Map points that are kept at most; each takes about 120 bytes."""
+    map_hz: float = Field(30.0, gt=0.0, le=topics.MAP.rate_hz)
+    """How often changes of the map are published, at most."""
+
+
+class Odometry(Service[OdometryConfig]):
+    """Registers every cloud to the map it is then merged into."""
+
+    Config = OdometryConfig
+    reads = (topics.CLOUD, topics.PROJECTOR)
+    optional = (topics.PROJECTOR,)
+    writes = (topics.POSE, topics.TRANSFORM, topics.MAP)
+    commands = ("reset", "snapshot")
+
+    def __init__(self, config: OdometryConfig) -> None:
+        super().__init__(config)
+        self.odometry = self._fresh()
+        self._revision = 0
+        self._next_map_ns = 0
+        self._sequence = 0
+        self._states: dict[str, int] = dict.fromkeys(Tracking, 0)
+
+    def warm(self) -> None:
+        """Compile every kernel on a textured plane, in an odometry of its own."""
+        trial = odometry.Odometry(capacity=100_000)
+        for sequence in range(3):
+            trial.track(_textured_plane(), sequence, sequence)
+        trial.map.take_delta()
+
+    def step(self, message: Message) -> Iterator[Message]:
+        match message:
+            case Cloud():
+                yield from self._track(message)
+            case ProjectorCalibration():
+                yield Transform(
+                    message.stamp_ns, "camera", message.frame_id, rigid.inverse(message.T_projector_camera)
+                )
+
+    def command(
+        self, verb: str, parameters: Mapping[str, Any], now_ns: int
+    ) -> Iterator[Message | Mapping[str, Any]]:
+        """``reset`` empties the map, the next cloud is the world; ``snapshot`` publishes the whole map."""
+        match verb:
+            case "reset":
+                self.odometry.reset()
+            case "snapshot":
+                self.odometry.map.take_delta()
+            case _:
+                raise Refused(f"no command {verb!r}; odometry knows: {', '.join(self.commands)}")
+        delta = merging.Delta(self.odometry.map.points(), np.empty((0, 3), np.int16))
+        yield self._map_delta(delta, now_ns, reset=True)
+        yield {"points": len(delta.points), "revision": self._revision}
+
+    def values(self) -> Mapping[str, float]:
+        """Map points, and clouds in each tracking state."""
+        return {"map_points": self.odometry.map.count, **self._states}
+
+    def trouble(self) -> str:
+        share = self.odometry.map.count / self.config.map_limit
+        if share < 0.9:
+            return ""
+        return f"the map is {share:.0%} full ({self.config.map_limit} points): raise map_limit or reset it"
+
+    def _fresh(self) -> odometry.Odometry:
+        return odometry.Odometry(1e-3 * self.config.merging_distance_um, self.config.map_limit)
+
+    def _track(self, cloud: Cloud) -> Iterator[Message]:
+        self._sequence = cloud.sequence
+        estimate = self.odometry.track(cloud.channels, cloud.sequence, cloud.stamp_ns)
+        self._states[estimate.state] += 1
+        yield Pose(
+            stamp_ns=cloud.stamp_ns,
+            sequence=cloud.sequence,
+            T_world_camera=estimate.T_world_camera,
+            information=estimate.information,
+            state=Tracking(estimate.state),
+            sigma_weak_um=1e3 * estimate.sigma_weak_mm,
+            weak_direction=estimate.weak_direction,
+            inlier_share=estimate.inlier_share,
+            residual_um=1e3 * estimate.residual_mm,
+            photometric_share=estimate.photometric_share,
+            submap=estimate.submap,
+            newest_stamp_ns=cloud.newest_stamp_ns,
+        )
+        yield Transform(cloud.stamp_ns, "world", cloud.frame_id, estimate.T_world_camera)
+        if cloud.stamp_ns >= self._next_map_ns:
+            self._next_map_ns = cloud.stamp_ns + round(1e9 / self.config.map_hz)
+            yield self._map_delta(self.odometry.map.take_delta(), cloud.stamp_ns, reset=self._revision == 0)
+
+    def _map_delta(self, delta: merging.Delta, stamp_ns: int, *, reset: bool) -> MapDelta:
+        self._revision += 1
+        return MapDelta(
+            stamp_ns=stamp_ns,
+            sequence=self._sequence,
+            points=delta.points,
+            removed=delta.removed,
+            revision=self._revision,
+            reset=reset,
+            map_points=self.odometry.map.count,
+            merging_distance_mm=self.odometry.map.merging_distance_mm,
+        )
+
+
+def _textured_plane() -> np.ndarray[Any, np.dtype[np.float32]]:
+    """(48, 64, 6) float32: enough of a cloud to run every step on."""
+    v, u = np.mgrid[:48, :64].astype(np.float32)
+    channels = np.empty((48, 64, 6), np.float32)
+    channels[..., 0], channels[..., 1], channels[..., 2] = (u - 32) / 3, (v - 24) / 3, 20.0
+    channels[..., 3] = 100.0 + 20.0 * np.sin(0.9 * u) * np.cos(0.7 * v)
+    channels[..., 4], channels[..., 5] = 1.0, 0.01
+    return channels
