@@ -115,21 +115,14 @@ def _table(board: Board, rig: str) -> Table:
     from rich.text import Text
 
     table = Table(title=f"endo3d/{rig}", box=box.SIMPLE_HEAD, title_justify="left", expand=True)
-    for name, justify in (
-        ("service", "left"),
-        ("state", "left"),
-        ("rate Hz", "right"),
-        ("p50 ms", "right"),
-        ("p99 ms", "right"),
-        ("CPU %", "right"),
-        ("MB", "right"),
-        ("lost", "left"),
-        ("note", "left"),
-    ):
-        table.add_column(name, justify=justify, ratio=1 if name in ("lost", "note") else None)  # type: ignore[arg-type]
+    for name in ("service", "state"):
+        table.add_column(name, no_wrap=True)
+    for name in ("rate Hz", "p50 ms", "p99 ms", "CPU %", "MB"):
+        table.add_column(name, justify="right", no_wrap=True)
+    table.add_column("lost, and why it is slow", ratio=1)
     for status, there in board.snapshot():
         state = str(status.state) if there else "gone"
-        lost = " ".join(f"{cause} {count}" for cause, count in status.dropped.items() if count)
+        lost = ", ".join(f"{cause} {count}" for cause, count in status.dropped.items() if count)
         table.add_row(
             status.service,
             Text(state, STATE_STYLES.get(state, "red")),
@@ -138,8 +131,7 @@ def _table(board: Board, rig: str) -> Table:
             f"{status.latency_p99_ms:.1f}",
             f"{100 * status.cpu_share:.0f}",
             f"{status.memory_mb:.0f}",
-            lost or "0",
-            status.note,
+            "\n".join(filter(None, (lost, status.note))) or "-",
         )
     if not board.statuses:
         table.caption = "nobody is there yet; Ctrl-C ends"
