@@ -107,7 +107,7 @@ def encode_into(message: Message, buffer: Buffer) -> int:
         raise ValueError(f"{size} bytes don't fit into {len(sample)}")
     header = _serialise(_WAYS[topics.of(message).name], message)
     before = front(header, DATA, array.nbytes, DATA_OFFSET)
-    if not array.flags.c_contiguous or _address(array) != _address(sample) + DATA_OFFSET:
+    if not _starts_at(array, sample[DATA_OFFSET:]):
         np.ndarray(array.shape, array.dtype, sample, DATA_OFFSET)[...] = array
     sample.data[:DATA_OFFSET] = before
     return size
@@ -182,10 +182,9 @@ def _bulk_array(message: Message) -> NDArray[Any]:
     return array
 
 
-def _address(array: NDArray[Any]) -> int:
-    """Of the first byte. (The interface of a structured array would list its fields, which takes 5 us.)"""
-    address: int = array.view(np.uint8).__array_interface__["data"][0]
-    return address
+def _starts_at(array: NDArray[Any], place: NDArray[np.uint8]) -> bool:
+    """Is ``array`` contiguous, its first byte that of ``place``? (numpy takes 6 us to tell two addresses.)"""
+    return array.flags.c_contiguous and np.may_share_memory(array.reshape(-1).view(np.uint8)[:1], place[:1])
 
 
 def _serialise(way: _Way, message: Message) -> bytes:

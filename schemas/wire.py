@@ -8,6 +8,8 @@ Reference: https://protobuf.dev/programming-guides/encoding
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 DELIMITED = 2
 """Wire type of bytes with a length; 0 is a varint, 1 eight bytes, 5 four."""
 PADDING = 101
@@ -80,6 +82,7 @@ _PADDING_TAG = varint(PADDING << 3 | DELIMITED)
 _PADDING_FRONT = len(_PADDING_TAG) + 2
 
 
+@lru_cache(maxsize=64)
 def field_front(number: int, length: int) -> bytes:
     """Tag and length of a length-delimited field."""
     return varint(number << 3 | DELIMITED) + varint(length)
