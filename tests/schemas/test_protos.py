@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import importlib.util
+import re
 import subprocess
 import sys
+from importlib.metadata import requires
 from pathlib import Path
 
 import numpy as np
@@ -120,6 +122,14 @@ def test_the_first_release_is_still_there():
     (ours,) = (file for file in released if file.name == "endo3d.proto")
     now = numbers(generated())
     assert {key: now.get(key) for key in numbers(ours)} == numbers(ours)
+
+
+def test_the_generated_code_runs_with_the_oldest_protobuf_we_allow():
+    (demanded,) = re.findall(r"Protobuf Python Version: (\d+)\.(\d+)", Path(endo3d_pb2.__file__).read_text())
+    (needed,) = (need for need in requires("endo3d") if need.startswith("protobuf"))
+    allowed = re.search(r">=(\d+)\.(\d+)", needed)
+    assert allowed is not None
+    assert tuple(map(int, demanded)) <= tuple(map(int, allowed.groups()))
 
 
 @pytest.mark.skipif(importlib.util.find_spec("grpc_tools") is None, reason="grpcio-tools is not installed")
