@@ -40,20 +40,30 @@ class Grabber(Source[Config]):
     writes = (topics.FRAME, topics.CAMERA, topics.PROJECTOR, topics.TRUTH)
     optional: ClassVar = (topics.MODE,)
 
+    def __init__(self, config: Config) -> None:
+        super().__init__(config)
+        self._camera: Camera | None = None
+        self.labels = Labels()
+        self.held: deque[Shot] = deque()
+        self.lent = 0
+        self.announced = False
+
+    @property
+    def camera(self) -> Camera:
+        if self._camera is None:
+            raise RuntimeError("the grabber has not been opened")
+        return self._camera
+
     def open(self) -> None:
         try:
             self.yaml = Path(self.config.head).read_text(encoding="utf-8")
-            self.camera: Camera = open_camera(self.config.camera, Setting(self.config.rig, self.yaml))
+            self._camera = open_camera(self.config.camera, Setting(self.config.rig, self.yaml))
         except OSError as error:
             raise UserError(
                 f"head {self.config.head!r}: {error.strerror}; name a file of deploy/heads"
             ) from error
         except (DeviceError, ValueError) as error:
             raise UserError(str(error)) from error
-        self.labels = Labels()
-        self.lent = 0
-        self.held: deque[Shot] = deque()
-        self.announced = False
         self.camera.arm()
 
     def step(self, message: Message) -> Iterator[Message]:
@@ -119,8 +129,9 @@ class Grabber(Source[Config]):
         )
 
     def losses(self) -> Mapping[str, int]:
-        return {**self.labels.losses, **{f"camera:{cause}": n for cause, n in self.camera.losses().items()}}
+        of_camera = self._camera.losses() if self._camera else {}
+        return {**self.labels.losses, **{f"camera:{cause}": count for cause, count in of_camera.items()}}
 
     def close(self) -> None:
-        if hasattr(self, "camera"):
-            self.camera.close()
+        if self._camera is not None:
+            self._camera.close()

@@ -45,11 +45,21 @@ class Sequencer(Source[Config]):
     writes = (topics.MODE,)
     commands: ClassVar = ("mode", "exposure", "start", "stop")
 
+    def __init__(self, config: Config) -> None:
+        super().__init__(config)
+        self._projector: Projector | None = None
+
+    @property
+    def projector(self) -> Projector:
+        if self._projector is None:
+            raise RuntimeError("the sequencer has not been opened")
+        return self._projector
+
     def open(self) -> None:
         try:
             yaml = Path(self.config.head).read_text(encoding="utf-8")
             self.sets = {name: patterns.parse(text) for name, text in self.config.modes.items()}
-            self.projector: Projector = open_projector(self.config.projector, Setting(self.config.rig, yaml))
+            self._projector = open_projector(self.config.projector, Setting(self.config.rig, yaml))
         except OSError as error:
             raise UserError(
                 f"head {self.config.head!r}: {error.strerror}; name a file of deploy/heads"
@@ -157,5 +167,5 @@ class Sequencer(Source[Config]):
         return self.shown
 
     def close(self) -> None:
-        if hasattr(self, "projector"):
-            self.projector.close()
+        if self._projector is not None:
+            self._projector.close()

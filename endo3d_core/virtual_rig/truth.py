@@ -11,9 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from endo3d_core.calibration import Lens, Rig
+from endo3d_core.calibration import Rig
 from endo3d_core.head import Head
 from endo3d_core.virtual_rig import casting
+from endo3d_core.virtual_rig.outline import inside
 from endo3d_core.virtual_rig.scene import Scene
 
 SHADOW_MM = 1e-6
@@ -64,9 +65,3 @@ def depths(scene: Scene, T_scene_view: NDArray[np.float64], rays: NDArray[np.flo
     for body in scene.bodies:
         casting.cast_exact(body.shape, np.linalg.inv(body.T_scene_body) @ T_scene_view, x, y, z)
     return np.where(np.isfinite(z), z, np.nan).reshape(rays.shape[:-1])
-
-
-def inside(lens: Lens, pixels: NDArray[np.float64], circle_px: float) -> NDArray[np.bool_]:
-    """(..., 2) pixels -> (...) whether the fibre is imaged there: a circle about the image's middle."""
-    centre = np.array(((lens.width - 1) / 2, (lens.height - 1) / 2))
-    return np.asarray(np.sum((pixels - centre) ** 2, axis=-1) <= (circle_px / 2) ** 2)

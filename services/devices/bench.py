@@ -1,7 +1,8 @@
 """The optical bench of the simulated devices: a file that holds the light.
 
 A simulated projector writes it (so does an emulated controller), a simulated camera reads it; they may live
-in different processes, start in any order and die. Layout: a JSON header under a sequence counter, then the pattern images.
+in different processes, start in any order and die. Layout: a JSON header under a sequence counter, then the
+pattern images.
 """
 
 from __future__ import annotations

@@ -25,7 +25,7 @@ from endo3d_core.head import Head
 from endo3d_core.virtual_rig import motion as motions
 from endo3d_core.virtual_rig import scene as scenes
 from endo3d_core.virtual_rig.effects import PRESETS
-from endo3d_core.virtual_rig.light import Light, ideal
+from endo3d_core.virtual_rig.light import Light
 from endo3d_core.virtual_rig.motion import Motion
 from endo3d_core.virtual_rig.renderer import Renderer
 
@@ -81,10 +81,7 @@ class SimCamera:
     def arm(self) -> None:
         self._changes = -1
         self._look()
-        blank = ideal(np.zeros((1, 1), np.uint8))
-        self._renderer.frame(
-            blank, np.eye(4), 1.0, 0, np.empty(self.shape, self.dtype)
-        )  # compile before the light
+        self._renderer.warm()
         if self._timeline is not None:
             self._next = max(0, self._timeline.last_begun(self.now_ns()) + 1)
 
@@ -120,13 +117,9 @@ class SimCamera:
         middle_ns = trigger_ns + round(exposure_us * 500)
         number = (trigger_ns - self._shown.begun_ns) // 1000 + self._seed * 7919
         simulated_us = exposure_us / self.slow_motion
-        self._renderer.frame(
-            self._lights[self._shown.images[slot]],
-            self.T_scene_camera(middle_ns),
-            simulated_us,
-            number,
-            image,
-        )
+        poses = self._renderer.poses(self._motion.T_scene_camera, self._simulated_s(middle_ns), simulated_us)
+        light = self._lights[self._shown.images[slot]]
+        self._renderer.frame(light, poses, simulated_us, number, image)
         self._frame_id += 1
         return Shot(image, trigger_ns, self._frame_id - 1, exposure_us)
 
@@ -145,7 +138,10 @@ class SimCamera:
         """The bench's light ends the exposure."""
 
     def T_scene_camera(self, stamp_ns: int) -> NDArray[np.float64]:
-        return self._motion.T_scene_camera((stamp_ns - self._shown.begun_ns) * 1e-9 / self.slow_motion)
+        return self._motion.T_scene_camera(self._simulated_s(stamp_ns))
+
+    def _simulated_s(self, stamp_ns: int) -> float:
+        return (stamp_ns - self._shown.begun_ns) * 1e-9 / self.slow_motion
 
     def now_ns(self) -> int:
         return time.time_ns()
@@ -169,7 +165,9 @@ class SimCamera:
             self._lent.append(self._exposing.image)
             self._exposing = None
         if shown.generation != self._generation:
-            self._lights = [ideal(self._bench.image(place, shown)) for place in range(shown.placed)]
+            self._lights = [
+                self._renderer.light(self._bench.image(place, shown)) for place in range(shown.placed)
+            ]
             self._generation = shown.generation
         if shown.running:
             periods_ns = np.rint((np.array(shown.exposures_us) + shown.dark_us) * 1e3).astype(np.int64)

@@ -16,7 +16,6 @@ from endo3d_core.head import Head
 from endo3d_core.virtual_rig import contour_standard as standard
 from endo3d_core.virtual_rig import motion, scene
 from endo3d_core.virtual_rig.effects import IDEAL
-from endo3d_core.virtual_rig.light import ideal
 from endo3d_core.virtual_rig.renderer import Renderer
 from endo3d_core.virtual_rig.truth import Truth, truth
 
@@ -147,7 +146,7 @@ def test_the_renderer_shows_the_true_phase(text: str) -> None:
     renderer = Renderer(rig, head, what, IDEAL, bin_px=2)
     n = rig.projector.width
     waves = [
-        renderer.radiance(ideal(patterns.image(p, n, n)), T).copy()
+        renderer.exposure(renderer.light(patterns.image(p, n, n)), [T]).copy()
         for p in patterns.conventional((25.0,), (4,)).patterns
     ]
     expected = truth(rig, head, what, T, 2)
