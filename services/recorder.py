@@ -84,6 +84,7 @@ class Recorder(Tap[RecorderConfig]):
         self._transform: Callable[[Entry], Entry] = _as_it_is
         self._crop: Crop | None = None
         self._spool: Spool | None = None
+        self._repairing: threading.Thread | None = None
         self._start_at_next = config.autostart
 
     def open(self) -> None:
@@ -91,7 +92,8 @@ class Recorder(Tap[RecorderConfig]):
         self._transform = _compactor() if self.config.compact else _as_it_is
         if self.config.directory.is_dir():
             repair = partial(_repair, self.config.directory)
-            threading.Thread(target=repair, name="repair", daemon=True).start()
+            self._repairing = threading.Thread(target=repair, name="repair", daemon=True)
+            self._repairing.start()
 
     def take(self, sample: Sample) -> Iterator[Message]:
         try:
@@ -153,6 +155,8 @@ class Recorder(Tap[RecorderConfig]):
 
     def close(self) -> None:
         self._stop()
+        if self._repairing is not None:
+            self._repairing.join()
 
     def _entry(self, sample: Sample, message: Message) -> Entry:
         """Where a sample goes in the log; its payload is still the sender's."""
@@ -200,10 +204,12 @@ class Recorder(Tap[RecorderConfig]):
     def _due(self, entry: Entry, topic: Topic) -> bool:
         """Whether the topic's archive rate has room for this message."""
         period_ns = self._period_ns[topic.name]
-        due_ns = self._due_ns.get(entry.channel, 0)
+        due_ns = self._due_ns.get(entry.channel, entry.log_ns)
         if period_ns is None or entry.log_ns < due_ns:
             return False
-        self._due_ns[entry.channel] = max(due_ns, entry.log_ns - period_ns) + period_ns
+        # In step with the rate while messages come, so that jitter costs none; from now on after a pause.
+        late = entry.log_ns >= due_ns + period_ns
+        self._due_ns[entry.channel] = (entry.log_ns if late else due_ns) + period_ns
         return True
 
     def _start(self, name: str, now_ns: int) -> Spool:

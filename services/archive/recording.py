@@ -92,7 +92,13 @@ class Recording:
             self.finish()
         path = self._unused_path()
         path.parent.mkdir(parents=True, exist_ok=True)
-        self._writer = writer = Writer(self._open_sink(path), LIBRARY)
+        sink = self._open_sink(path)
+        try:
+            self._writer = writer = Writer(sink, LIBRARY)
+        except OSError:
+            sink.close()
+            path.unlink()
+            raise
         self.parts.append(path)
         self._part_start_ns = entry.log_ns
         writer.note("endo3d", self._facts | {"part": str(len(self.parts) - 1)})

@@ -159,9 +159,7 @@ class Spool:
     def _look_at_disk(self) -> None:
         free_bytes = _free_bytes(self.recording.path.parent)
         if free_bytes < self._floor_bytes and not self.trouble:
-            self._stop(
-                f"only {free_bytes >> 20} MB left on the disk: recording closed; make room, start again"
-            )
+            self._stop(f"only {free_bytes >> 20} MB left on the disk: log closed; make room, start again")
             self.recording.finish()
 
     def _guarded(self, write: Callable[..., None], *arguments: Entry) -> bool:

@@ -34,7 +34,10 @@ class Kind(NamedTuple):
 
 
 class Writer:
-    """One MCAP file. Not thread-safe. After an ``OSError``: ``abandon_tail``, then ``finish`` or ``leave_torn``."""
+    """One MCAP file. Not thread-safe.
+
+    After an ``OSError``: ``abandon_tail``, then ``finish``; ``leave_torn`` when that fails as well.
+    """
 
     def __init__(self, sink: Sink, library: str) -> None:
         self._sink = sink

@@ -56,10 +56,11 @@ def mode(epoch: int = 1) -> m.Mode:
 
 
 def sample(message: m.Message, received_ns: int | None = None, source: str = "") -> Sample:
-    """A message as it travels; it arrives 1 ms after its stamp unless told."""
-    encoded = memoryview(codec.encode(message))
-    received_ns = message.stamp_ns + 1_000_000 if received_ns is None else received_ns
-    return Sample(topics.of(message), source, encoded, received_ns)
+    """A message as it travels; it arrives 1 ms after its stamp unless told, and no two at the same time."""
+    topic = topics.of(message)
+    if received_ns is None:
+        received_ns = message.stamp_ns + 1_000_000 + topics.TOPICS.index(topic)
+    return Sample(topic, source, memoryview(codec.encode(message)), received_ns)
 
 
 def take(recorder: Recorder, messages: Iterable[m.Message]) -> None:
