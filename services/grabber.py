@@ -24,7 +24,7 @@ HELD = 2
 """Shots that wait for their mode to be announced."""
 
 
-class Config(service.Config):
+class GrabberConfig(service.Config):
     camera: str = "sim:"
     """The device's URI."""
     rig: str = "demo"
@@ -34,13 +34,13 @@ class Config(service.Config):
     """Frames of shared memory that the camera holds in advance."""
 
 
-class Grabber(Source[Config]):
-    Config = Config
+class Grabber(Source[GrabberConfig]):
+    Config = GrabberConfig
     reads = (topics.MODE,)
     writes = (topics.FRAME, topics.CAMERA, topics.PROJECTOR, topics.TRUTH)
     optional: ClassVar = (topics.MODE,)
 
-    def __init__(self, config: Config) -> None:
+    def __init__(self, config: GrabberConfig) -> None:
         super().__init__(config)
         self._camera: Camera | None = None
         self.labels = Labels()

@@ -20,7 +20,7 @@ from endo3d_core import patterns
 from endo3d_core.patterns import PatternSet
 
 
-class Config(service.Config):
+class SequencerConfig(service.Config):
     projector: str = "sim:"
     """The device's URI."""
     rig: str = "demo"
@@ -40,12 +40,12 @@ class Config(service.Config):
     autostart: bool = True
 
 
-class Sequencer(Source[Config]):
-    Config = Config
+class Sequencer(Source[SequencerConfig]):
+    Config = SequencerConfig
     writes = (topics.MODE,)
     commands: ClassVar = ("mode", "exposure", "start", "stop")
 
-    def __init__(self, config: Config) -> None:
+    def __init__(self, config: SequencerConfig) -> None:
         super().__init__(config)
         self._projector: Projector | None = None
 

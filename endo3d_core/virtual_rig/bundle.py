@@ -132,7 +132,8 @@ def _leak(cores: NDArray[np.float64]) -> Sparse:
     _, neighbours = cKDTree(cores).query(cores, count)
     kept = 1.0 - NEAREST[0] * NEAREST[1] - NEXT[0] * NEXT[1] - TAIL_SHARE
     shares = np.array([kept] + [NEAREST[1]] * NEAREST[0] + [NEXT[1]] * NEXT[0])
-    return _sparse(neighbours.astype(np.int64), np.broadcast_to(shares, neighbours.shape))
+    columns = np.asarray(neighbours, np.int64)
+    return _sparse(columns, np.broadcast_to(shares, neighbours.shape))
 
 
 class _Tail:
