@@ -17,7 +17,7 @@ from endo3d.schemas.messages import Frame, Message, Mode, Truth
 from endo3d.services.archive.reader import Log, Record
 from endo3d.services.runtime.service import Config, Refused, Source
 
-_NEVER_NS = 1 << 62
+_NEVER_NS = 1 << 63
 EPOCHS_PER_PASS = 1 << 16
 
 
@@ -61,6 +61,9 @@ class Player(Source[PlayerConfig]):
         self._anchor: tuple[int, int] | None = None
         """A recorded stamp and the time it was played at."""
         self._played = False
+        self._frame_due_ns: int | None = None
+        self._next_frame_ns = 0
+        """When the frame after the last is due, if it comes a period later: a loop has no gap and no rush."""
         self._passes = -1
         self._next_sequence = 0
         self._sequence_shift: int | None = None
@@ -116,12 +119,16 @@ class Player(Source[PlayerConfig]):
         self._position_s = position_s
         self._anchor = None
         self._played = False
+        self._frame_due_ns = None
+        self._next_frame_ns = 0
         self._passes += 1
         self._sequence_shift = None
 
     def _at_end(self) -> None:
         if self.config.loop and self._played:
+            next_ns = self._next_frame_ns
             self._seek(self.config.start_s)
+            self._next_frame_ns = next_ns
         else:
             self.finished = True
 
@@ -130,11 +137,11 @@ class Player(Source[PlayerConfig]):
         if self._rate == 0:
             return _NEVER_NS
         if record.stream.topic is topics.FRAME and (self._anchor is None or math.isinf(self._rate)):
-            self._anchor = (record.publish_ns, now_ns)
-        return now_ns if self._anchor is None else self._played_ns(record.publish_ns, self._anchor)
-
-    def _played_ns(self, recorded_ns: int, anchor: tuple[int, int]) -> int:
-        return anchor[1] + round((recorded_ns - anchor[0]) / self._rate)
+            self._anchor = (record.publish_ns, max(now_ns, self._next_frame_ns))
+        if self._anchor is None:
+            return now_ns
+        recorded_ns, played_ns = self._anchor
+        return played_ns + round((record.publish_ns - recorded_ns) / self._rate)
 
     def _again(self, record: Record, due_ns: int) -> Message:
         """The recorded message as a camera would give it now."""
@@ -152,6 +159,8 @@ class Player(Source[PlayerConfig]):
             case Truth():
                 return replace(message, sequence=self._sequence(message.sequence))
             case Frame():
+                self._next_frame_ns = due_ns + (due_ns - (self._frame_due_ns or due_ns))
+                self._frame_due_ns = due_ns
                 image = self.loan(topics.FRAME, message.image.shape, message.image.dtype)
                 np.copyto(image, message.image)
                 return replace(

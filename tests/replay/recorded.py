@@ -59,7 +59,8 @@ def sample(message: m.Message, received_ns: int | None = None, source: str = "")
     """A message as it travels; it arrives 1 ms after its stamp unless told, and no two at the same time."""
     topic = topics.of(message)
     if received_ns is None:
-        received_ns = message.stamp_ns + 1_000_000 + topics.TOPICS.index(topic)
+        order = topics.TOPICS.index(topic) + (0 if topic.latched else 100)
+        received_ns = message.stamp_ns + 1_000_000 + order
     return Sample(topic, source, memoryview(codec.encode(message)), received_ns)
 
 
