@@ -2,23 +2,52 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
+import numpy as np
 import rerun.blueprint as rrb
+from numpy.typing import NDArray
 
 from endo3d.services.views import entries
 
 
-def scan_blueprint() -> rrb.Blueprint:
+@dataclass(frozen=True)
+class Stand:
+    """From where the cloud is seen first, all (3,), mm."""
+
+    position: NDArray[np.floating]
+    target: NDArray[np.floating]
+    up: NDArray[np.floating]
+
+
+NIGHT = (24, 26, 31)
+BEFORE_ANY_MAP = Stand(np.array([-14.0, 34.0, -18.0]), np.array([4.0, 0.0, 14.0]), np.array([0.0, 0.0, -1.0]))
+"""The world is the first camera's: the surface lies 10..20 mm along z."""
+
+
+def scan_blueprint(stand: Stand = BEFORE_ANY_MAP) -> rrb.Blueprint:
     """Merged cloud, way and frustum; live image, depth map; plots of rate, latency, residual and sigma."""
     plots = entries.PLOTS
     return rrb.Blueprint(
         rrb.Horizontal(
             rrb.Vertical(
-                rrb.Spatial3DView(
-                    origin="/" + entries.WORLD,
-                    name="map",
-                    contents=["+ $origin/**", f"- /{entries.PROJECTOR}/**"],
-                    background=(24, 26, 31),
-                    line_grid=False,
+                rrb.Tabs(
+                    rrb.Spatial3DView(
+                        origin="/" + entries.WORLD,
+                        name="map",
+                        contents=["+ $origin/**", f"- /{entries.PROJECTOR}/**", f"- /{entries.CLOUD}"],
+                        background=NIGHT,
+                        line_grid=False,
+                        eye_controls=rrb.EyeControls3D(
+                            kind=rrb.Eye3DKind.Orbital,
+                            position=stand.position,
+                            look_target=stand.target,
+                            eye_up=stand.up,
+                        ),
+                    ),
+                    rrb.Spatial3DView(
+                        origin="/" + entries.CAMERA, name="cloud", background=NIGHT, line_grid=False
+                    ),
                 ),
                 rrb.Horizontal(
                     rrb.TimeSeriesView(

@@ -8,13 +8,19 @@ import numpy as np
 
 from endo3d.schemas import messages as m
 from endo3d.services.views import entries
+from endo3d.services.views.blueprint import BEFORE_ANY_MAP, Stand
 from endo3d.services.views.colouring import colouring
 from endo3d.services.views.entries import Entry
 from endo3d.services.views.merged import MergedMap
+from endo3d.services.views.principal import principal
 from endo3d.services.views.scan import xyz
+from endo3d.services.views.splat import looking, oblique
 
 MOST_SHOWN = 400_000
 """Points of the merged map on the screen; of a larger map every k-th."""
+
+RERUN_FIELD_DEG = 68.0
+"""Across Rerun's 3-D view of about 4 : 3."""
 
 
 class Display:
@@ -70,6 +76,18 @@ class Display:
         rgb = colouring(points, self.colour, self.viewer).rgb()
         radius_mm = 0.6 * self.merged.merging_distance_mm or entries.CLOUD_RADIUS_MM
         yield entries.points_entry(entries.MAP, xyz(points), rgb, radius_mm)
+
+    def stand(self) -> Stand:
+        """From where map and way are seen whole."""
+        points = self.merged.points()
+        if points is None or len(points) < 3:
+            return BEFORE_ANY_MAP
+        positions = xyz(points[:: -(-len(points) // 50_000)])
+        axes, centre = principal(positions, self.viewer)
+        seen = np.concatenate([positions, np.reshape(self.way, (-1, 3))])
+        eye = looking(seen, oblique(axes), axes[2], (1600, 1200), field_deg=RERUN_FIELD_DEG)
+        ahead = (centre - eye.position) @ eye.R[2]
+        return Stand(eye.position, eye.position + ahead * eye.R[2], axes[2])
 
     def _pose(self, pose: m.Pose) -> Iterator[Entry]:
         if not self._due("pose", pose.stamp_ns):

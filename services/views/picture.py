@@ -15,11 +15,10 @@ from endo3d.services.views.colour import spread
 from endo3d.services.views.colouring import Colouring, colouring
 from endo3d.services.views.principal import principal
 from endo3d.services.views.scan import Scan, xyz
-from endo3d.services.views.splat import Eye, looking, render
+from endo3d.services.views.splat import Eye, looking, oblique, render
 
 SIZE_PX = (2400, 1350)
 SCENE_PX = (1650, 1350)
-TILT_DEG, TURN_DEG = 52.0, 24.0
 WAY_RGB = (255, 166, 77)
 FRUSTUM_RGB = (255, 214, 160)
 MOST_POINTS = 3_000_000
@@ -65,10 +64,7 @@ def three_d(
     track = scan.track()
     frustum = _frustum(scan, track[-1]) if len(track) else np.empty((0, 3))
     seen = np.concatenate([points[:: max(1, len(points) // 50_000)], track[:, :3, 3], frustum])
-    tilt, turn = np.deg2rad([TILT_DEG, TURN_DEG])
-    across = np.cos(turn) * axes[1] + np.sin(turn) * axes[0]
-    direction = np.sin(tilt) * -axes[2] + np.cos(tilt) * across
-    eye = looking(seen, direction, axes[2], (2 * size[0], 2 * size[1]))
+    eye = looking(seen, oblique(axes), axes[2], (2 * size[0], 2 * size[1]))
     image, depth = render(points, rgb, eye, _spacing_mm(points, scan.merged.merging_distance_mm))
     if len(track):
         _line(image, depth, eye, track[:, :3, 3], WAY_RGB, 5)

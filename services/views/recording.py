@@ -31,3 +31,4 @@ def play(messages: Iterable[Message], sink: Sink, display: Display) -> None:
             sink.log(message.stamp_ns, entry)
     for entry in display.map_now():
         sink.log(last_ns, entry)
+    sink.lay_out(scan_blueprint(display.stand()))

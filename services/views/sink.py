@@ -32,6 +32,8 @@ class Sink(Protocol):
 
     def log(self, stamp_ns: int, entry: Entry) -> None: ...
 
+    def lay_out(self, blueprint: rrb.Blueprint) -> None: ...
+
     def close(self) -> None: ...
 
 
@@ -46,6 +48,10 @@ class FileSink:
 
     def log(self, stamp_ns: int, entry: Entry) -> None:
         _log(self._recording, stamp_ns, entry)
+
+    def lay_out(self, blueprint: rrb.Blueprint) -> None:
+        """Replaces the layout."""
+        self._recording.send_blueprint(blueprint)
 
     def close(self) -> None:
         self._recording.flush()
@@ -86,6 +92,12 @@ class ViewerSink:
         self._under_way += entry.size
         if self._under_way > WINDOW_BYTES:
             self._drained(stamp_ns)
+
+    def lay_out(self, blueprint: rrb.Blueprint) -> None:
+        """Replaces the layout, also for a viewer that comes back."""
+        self._blueprint = blueprint
+        if not self.trouble:
+            self._recording.send_blueprint(blueprint)
 
     def close(self) -> None:
         """Says goodbye to a viewer that listens; one that doesn't is left to itself."""

@@ -39,6 +39,16 @@ class Eye:
         return np.stack([u, v, depth], axis=1)
 
 
+TILT_DEG, TURN_DEG = 52.0, 24.0
+
+
+def oblique(axes: NDArray[np.floating]) -> NDArray[np.float64]:
+    """(3,) direction of view onto a cloud with these principal axes: like a table seen from a chair."""
+    tilt, turn = np.deg2rad([TILT_DEG, TURN_DEG])
+    across = np.cos(turn) * axes[1] + np.sin(turn) * axes[0]
+    return np.asarray(np.sin(tilt) * -axes[2] + np.cos(tilt) * across)
+
+
 def looking(
     at: NDArray[np.floating],
     direction: NDArray[np.floating],
