@@ -96,7 +96,8 @@ def cloud(message: m.Cloud | m.MapDelta, points: NDArray[Any]) -> dict[str, Any]
     metric = np.empty(points.shape, [(name, "<f4") for name in names])
     for name in names:
         metric[name] = points[name] * np.float32(1e-3) if name in METRES else points[name]
-    height, width = (1, *metric.shape)[-2:]
+    shape: tuple[int, ...] = points.shape
+    height, width = shape if len(shape) == 2 else (1, shape[0])
     return {
         "header": header(message.stamp_ns, message.frame_id),
         "height": height,
