@@ -1,0 +1,241 @@
+"""Bundle adjustment of camera, projector, their transform and all board poses at once.
+
+Minimises the reprojection error in both images over every parameter, with Huber weights (Triggs et al.,
+Bundle adjustment: a modern synthesis, 2000). The covariance is sigma^2 (J^T W J)^-1 with sigma from the
+residuals, so each parameter comes with its standard deviation.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from endo3d_core.calibrating.sighting import Sighting
+from endo3d_core.calibration import Lens, Rig
+
+Vector = NDArray[np.float64]
+Matrix = NDArray[np.float64]
+
+LENS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
+RIG = ("rx", "ry", "rz", "tx", "ty", "tz")
+NAMES = (
+    tuple(f"camera.{n}" for n in LENS)
+    + tuple(f"projector.{n}" for n in LENS)
+    + tuple(f"rig.{n}" for n in RIG)
+)
+"""The rig's parameters; the rotation as a vector (rad), the translation in mm."""
+
+CAMERA, PROJECTOR, BETWEEN = slice(0, 9), slice(9, 18), slice(18, 24)
+POSE = 6
+HUBER = 1.345
+"""Of a residual in standard deviations: 95 % efficient on normal noise."""
+ITERATIONS = 60
+CONVERGED = 1e-10
+"""Relative decrease of the cost at which the iteration ends."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Solution:
+    """A calibrated rig and how well it is known."""
+
+    rig: Rig
+    sigma: dict[str, float]
+    """Standard deviation of each free parameter of ``NAMES``."""
+    covariance: Matrix
+    """(p, p) of the free parameters, in the order of ``sigma``."""
+    poses: Matrix
+    """(sightings, 6): rotation vector and translation (mm) of T_camera_board."""
+    residual_px: tuple[NDArray[np.float64], ...]
+    """Per sighting (n, 4): reprojection error in the camera (x, y) and in the projector (x, y)."""
+
+    @property
+    def rms_px(self) -> tuple[float, float]:
+        """Root mean square of the error's length, camera and projector."""
+        stacked = np.concatenate(self.residual_px)
+        return _length_rms(stacked[:, :2]), _length_rms(stacked[:, 2:])
+
+    def pose_rms_px(self, index: int) -> float:
+        """The same of one sighting over both images."""
+        return _length_rms(self.residual_px[index].reshape(-1, 2))
+
+
+def _length_rms(error: NDArray[np.float64]) -> float:
+    return float(np.sqrt(np.mean(np.sum(error**2, axis=1))))
+
+
+def solve(
+    sightings: list[Sighting],
+    camera_size: tuple[int, int],
+    projector_size: tuple[int, int],
+    *,
+    fixed: frozenset[str] = frozenset({"camera.k3", "projector.k3"}),
+) -> Solution:
+    """Calibrate from at least three poses of a plane.
+
+    ``fixed`` parameters keep their starting value (distortion terms: zero). Sizes are (width, height) px.
+    Raises ``ValueError`` when the poses can't determine the rig.
+    """
+    if len(sightings) < 3:
+        raise ValueError(
+            f"{len(sightings)} poses can't calibrate two lenses; at least 3 are needed, 10..15 are good"
+        )
+    unknown = fixed - set(NAMES)
+    if unknown:
+        raise ValueError(f"no parameter is called {sorted(unknown)[0]!r}")
+    parameters = _start(sightings, camera_size, projector_size)
+    free = np.ones(parameters.size, bool)
+    free[[NAMES.index(name) for name in fixed]] = False
+    parameters = _minimise(parameters, free, sightings)
+    residual, J = _linearise(parameters, sightings)
+    weight = _huber(residual)
+    J = J[:, free]
+    normal = (J.T * weight) @ J
+    freedom = weight.sum() - J.shape[1]
+    if freedom <= 0:
+        raise ValueError("there are fewer measurements than parameters; take more poses")
+    try:
+        scale = np.sqrt(np.diag(normal))
+        inverse = np.linalg.inv(normal / np.outer(scale, scale)) / np.outer(scale, scale)
+    except np.linalg.LinAlgError as error:
+        raise ValueError(
+            "the poses don't determine the rig; tilt the board more, in several directions"
+        ) from error
+    covariance = inverse * float(weight @ residual**2) / freedom
+    known = int(free[: len(NAMES)].sum())
+    names = [name for name, is_free in zip(NAMES, free, strict=False) if is_free]
+    sigma = dict(zip(names, np.sqrt(np.diag(covariance)[:known]).tolist(), strict=True))
+    return Solution(
+        rig_of(parameters, camera_size, projector_size),
+        sigma,
+        covariance[:known, :known],
+        parameters[len(NAMES) :].reshape(-1, POSE),
+        tuple(_by_sighting(residual, sightings)),
+    )
+
+
+def rig_of(parameters: Vector, camera_size: tuple[int, int], projector_size: tuple[int, int]) -> Rig:
+    """The rig that the first 24 parameters describe."""
+    lenses = []
+    for part, size in ((parameters[CAMERA], camera_size), (parameters[PROJECTOR], projector_size)):
+        lenses.append(Lens(*size, _K(part), part[4:9]))
+    between = parameters[BETWEEN]
+    return Rig(lenses[0], lenses[1], cv2.Rodrigues(between[:3])[0], between[3:])
+
+
+def _start(
+    sightings: list[Sighting], camera_size: tuple[int, int], projector_size: tuple[int, int]
+) -> Vector:
+    """Each lens by Zhang's method on its own, and the transform that agrees best between them."""
+    board = [s.board_mm.astype(np.float32) for s in sightings]
+    flags = cv2.CALIB_FIX_K3
+    lenses, poses = [], []
+    for size, pixels in (
+        (camera_size, [s.camera_px for s in sightings]),
+        (projector_size, [s.projector_px for s in sightings]),
+    ):
+        seen = [p.astype(np.float32) for p in pixels]
+        try:
+            _, K, dist, r, t = cv2.calibrateCamera(board, seen, size, np.eye(3), np.zeros(5), flags=flags)
+        except cv2.error as error:
+            raise ValueError("the poses don't determine the lenses; tilt the board more") from error
+        lenses.append(np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2], *dist.ravel()[:5]]))
+        poses.append([(cv2.Rodrigues(a)[0], b.ravel()) for a, b in zip(r, t, strict=True)])
+    rotations = [Rp @ Rc.T for (Rc, _), (Rp, _) in zip(*poses, strict=True)]
+    U, _, Vt = np.linalg.svd(np.sum(rotations, axis=0))
+    R = U @ Vt
+    t = np.median([tp - R @ tc for (_, tc), (_, tp) in zip(*poses, strict=True)], axis=0)
+    camera_poses = [np.concatenate((cv2.Rodrigues(Rc)[0].ravel(), tc)) for Rc, tc in poses[0]]
+    return np.concatenate((*lenses, cv2.Rodrigues(R)[0].ravel(), t, *camera_poses))
+
+
+def _minimise(parameters: Vector, free: NDArray[np.bool_], sightings: list[Sighting]) -> Vector:
+    """Levenberg-Marquardt with Marquardt's scaling, Huber weights renewed in every step."""
+    damping = 1e-4
+    residual, J = _linearise(parameters, sightings)
+    cost = _cost(residual)
+    for _ in range(ITERATIONS):
+        weighted = J[:, free].T * _huber(residual)
+        normal = weighted @ J[:, free]
+        step = np.linalg.solve(normal + damping * np.diag(np.diag(normal)), weighted @ residual)
+        trial = parameters.copy()
+        trial[free] -= step
+        trial_residual, trial_J = _linearise(trial, sightings)
+        trial_cost = _cost(trial_residual)
+        if trial_cost < cost:
+            done = cost - trial_cost < CONVERGED * cost
+            parameters, residual, J, cost = trial, trial_residual, trial_J, trial_cost
+            damping = max(damping / 10, 1e-12)
+            if done:
+                break
+        else:
+            damping *= 10
+            if damping > 1e8:
+                break
+    return parameters
+
+
+def _sigma(residual: Vector) -> float:
+    """Standard deviation from the median absolute residual, so that outliers don't raise it."""
+    return max(1.4826 * float(np.median(np.abs(residual))), 1e-12)
+
+
+def _huber(residual: Vector) -> Vector:
+    ratio = np.abs(residual) / (HUBER * _sigma(residual))
+    return np.asarray(1.0 / np.maximum(ratio, 1.0))
+
+
+def _cost(residual: Vector) -> float:
+    """Mean absolute residual past the Huber knee, square before it."""
+    knee = HUBER * _sigma(residual)
+    size = np.abs(residual)
+    return float(np.sum(np.where(size < knee, size**2, 2 * knee * size - knee**2)))
+
+
+def _linearise(parameters: Vector, sightings: list[Sighting]) -> tuple[Vector, Matrix]:
+    """Residuals (predicted - seen), camera then projector per sighting, and their Jacobian."""
+    rows = 4 * sum(len(s.board_mm) for s in sightings)
+    residual, J = np.zeros(rows), np.zeros((rows, parameters.size))
+    at = 0
+    for index, sighting in enumerate(sightings):
+        n = 2 * len(sighting.board_mm)
+        pose = slice(len(NAMES) + POSE * index, len(NAMES) + POSE * (index + 1))
+        r, t = parameters[pose][:3], parameters[pose][3:]
+        seen = slice(at, at + n)
+        pixels, dpose, dlens = _projection(sighting.board_mm, r, t, parameters[CAMERA])
+        residual[seen] = (pixels - sighting.camera_px).ravel()
+        J[seen, pose], J[seen, CAMERA] = dpose, dlens
+
+        lit = slice(at + n, at + 2 * n)
+        between = parameters[BETWEEN]
+        r3, t3, *derivatives = cv2.composeRT(r, t, between[:3], between[3:])
+        dr3dr1, dr3dt1, dr3dr2, dr3dt2, dt3dr1, dt3dt1, dt3dr2, dt3dt2 = derivatives
+        pixels, dpose, dlens = _projection(sighting.board_mm, r3.ravel(), t3.ravel(), parameters[PROJECTOR])
+        residual[lit] = (pixels - sighting.projector_px).ravel()
+        J[lit, pose] = dpose @ np.block([[dr3dr1, dr3dt1], [dt3dr1, dt3dt1]])
+        J[lit, BETWEEN] = dpose @ np.block([[dr3dr2, dr3dt2], [dt3dr2, dt3dt2]])
+        J[lit, PROJECTOR] = dlens
+        at += 2 * n
+    return residual, J
+
+
+def _projection(board_mm: Matrix, r: Vector, t: Vector, lens: Vector) -> tuple[Matrix, Matrix, Matrix]:
+    """Pixels (n, 2), and their derivatives by the pose (2 n, 6) and by the lens (2 n, 9)."""
+    pixels, J = cv2.projectPoints(board_mm, r, t, _K(lens), lens[4:9])
+    return pixels.reshape(-1, 2), J[:, :6], J[:, 6:15]
+
+
+def _K(lens: Vector) -> Matrix:
+    return np.array([[lens[0], 0.0, lens[2]], [0.0, lens[1], lens[3]], [0.0, 0.0, 1.0]])
+
+
+def _by_sighting(residual: Vector, sightings: list[Sighting]) -> list[NDArray[np.float64]]:
+    parts, at = [], 0
+    for sighting in sightings:
+        n = 2 * len(sighting.board_mm)
+        camera, projector = residual[at : at + n].reshape(-1, 2), residual[at + n : at + 2 * n].reshape(-1, 2)
+        parts.append(np.hstack((camera, projector)))
+        at += 2 * n
+    return parts
