@@ -78,6 +78,18 @@ def cast_exact(
             sphere.cast_exact(shape.radius_mm, T, rx, ry, z)
 
 
+def distances(shape: Shape, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(n, 3) points of the body's axes -> (n,) signed distances to its surface, positive outside, mm."""
+    match shape:
+        case Profile():
+            out = np.empty(len(points))
+            x, z = (np.ascontiguousarray(points[:, k]) for k in (0, 2))
+            profile.distances(shape.primitives, x, z, out)
+            return out
+        case Sphere():
+            return np.asarray(np.linalg.norm(points, axis=1) - shape.radius_mm)
+
+
 class ProfileSight:
     def __init__(self, shape: Profile, T: NDArray[np.float64], field: Field) -> None:
         self.T = T.astype(np.float32)

@@ -21,7 +21,7 @@ class Texture:
     """``none``, ``noise`` or ``checker``."""
     contrast: float = 0.0
     """noise: standard deviation; checker: half the difference. Relative to the albedo."""
-    size_mm: float = 0.06
+    size_mm: float = 0.15
     """noise: correlation length; checker: side of a square."""
 
     @property

@@ -26,7 +26,7 @@ class Profile:
     """Primitives of one connected or loose contour."""
 
     primitives: NDArray[np.float64]
-    """(n, 6): LINE x0 z0 x1 z1 - ; ARC cx cz radius middle half (rad, seen from the centre)."""
+    """(n, 7): LINE x0 z0 x1 z1 - - ; ARC cx cz radius middle half (rad, from the centre) side (1: convex)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +60,7 @@ class Contour:
         x, height, _ = self._corners[-1]
         half = math.radians(half_angle_deg)
         cx, cz = x + radius_mm * math.sin(half), -height + radius_mm * math.cos(half)
-        self._primitives.append((ARC, cx, cz, radius_mm, -math.pi / 2, half))
+        self._primitives.append((ARC, cx, cz, radius_mm, -math.pi / 2, half, 1.0))
         self._corners = [(2 * cx - x, height, 0.0)]
         return self
 
@@ -89,7 +89,9 @@ class Contour:
                 outward = end - centre
                 self._line(start, end + a * tangent)
                 angle = math.atan2(outward[1], outward[0])
-                self._primitives.append((ARC, *centre, radius, angle, math.pi / 2 - half))
+                # Drawn from left to right, the line before the corner has the air on the side (-a_z, a_x).
+                side = 1.0 if outward @ np.array((-a[1], a[0])) > 0.0 else -1.0
+                self._primitives.append((ARC, *centre, radius, angle, math.pi / 2 - half, side))
                 start = end + b * tangent
             else:
                 self._line(start, end)
@@ -98,7 +100,7 @@ class Contour:
 
     def _line(self, a: NDArray[np.float64], b: NDArray[np.float64]) -> None:
         if np.hypot(*(b - a)) > 1e-12:
-            self._primitives.append((LINE, *a, *b, 0.0))
+            self._primitives.append((LINE, *a, *b, 0.0, 0.0))
 
 
 def _unit(v: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -201,6 +203,43 @@ def cast_exact(
             s, _, _ = hit(primitives[k], T[0, 3], T[2, 3], dx, dz)
             if s < z[i]:
                 z[i] = s
+
+
+@exact
+def distances(
+    primitives: NDArray[np.float64], x: NDArray[np.float64], z: NDArray[np.float64], out: NDArray[np.float64]
+) -> None:
+    """Signed distances (n,) of points to the contour, positive on the sensor's side."""
+    for i in range(x.size):
+        nearest = np.inf
+        for k in range(primitives.shape[0]):
+            d = _distance(primitives[k], x[i], z[i])
+            if abs(d) < abs(nearest):
+                nearest = d
+        out[i] = nearest
+
+
+@exact
+def _distance(primitive: NDArray[np.float64], x: float, z: float) -> float:
+    if primitive[0] == LINE:
+        ex, ez = primitive[3] - primitive[1], primitive[4] - primitive[2]
+        px, pz = x - primitive[1], z - primitive[2]
+        length2 = ex * ex + ez * ez
+        t = min(max((px * ex + pz * ez) / length2, 0.0), 1.0)
+        side = 1.0 if px * ez - pz * ex > 0.0 else -1.0
+        return side * math.hypot(px - t * ex, pz - t * ez)
+    px, pz, radius, middle, half = (
+        x - primitive[1],
+        z - primitive[2],
+        primitive[3],
+        primitive[4],
+        primitive[5],
+    )
+    angle = math.atan2(pz, px) - middle
+    angle -= 2.0 * math.pi * math.floor(angle / (2.0 * math.pi) + 0.5)
+    side = primitive[6] if math.hypot(px, pz) > radius else -primitive[6]
+    at = middle + min(max(angle, -half), half)
+    return float(side * math.hypot(px - radius * math.cos(at), pz - radius * math.sin(at)))
 
 
 @kernel

@@ -8,7 +8,7 @@
     sphere r=1 at=0,0,19 + plane z=20
 
 Of every body: ``at=x,y,z`` (mm, in the camera's axes at time 0; z defaults to the working distance),
-``turn=a,b,c`` (rotation vector, deg), ``albedo=0.7``, ``texture=noise:0.15`` or ``noise:0.15:0.06``
+``turn=a,b,c`` (rotation vector, deg), ``albedo=0.7``, ``texture=noise:0.15`` or ``noise:0.15:0.3``
 (contrast, size in mm), ``texture=checker:0.5:1``, ``surface=metal``, ``specular=``, ``gloss=``.
 """
 
@@ -149,7 +149,7 @@ def _texture(kind: str, text: str) -> Texture:
     if name == "none" and not values:
         return Texture()
     if name in ("noise", "checker") and 1 <= len(values) <= 2 and 0.0 < values[0] < 1.0 and min(values) > 0.0:
-        return Texture(name, values[0], values[1] if len(values) == 2 else (0.06 if name == "noise" else 1.0))
+        return Texture(name, values[0], values[1] if len(values) == 2 else (0.15 if name == "noise" else 1.0))
     raise ValueError(
         f"scene {kind!r}: texture={text} is not none, noise:CONTRAST[:SIZE_MM] or checker:CONTRAST[:SIZE_MM]"
     )

@@ -58,6 +58,20 @@ def truth(rig: Rig, head: Head, scene: Scene, T_scene_camera: NDArray[np.float64
     return Truth(depth, pixel, visible)
 
 
+def distance(scene: Scene, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(n, 3) points of the scene's axes -> (n,) signed distances to the nearest surface, mm.
+
+    Positive on the sensor's side. For ``metrology.surface_error``.
+    """
+    nearest = np.full(len(points), np.inf)
+    for body in scene.bodies:
+        T_body_scene = np.linalg.inv(body.T_scene_body)
+        local = np.ascontiguousarray(points @ T_body_scene[:3, :3].T + T_body_scene[:3, 3], np.float64)
+        d = casting.distances(body.shape, local)
+        nearest = np.where(np.abs(d) < np.abs(nearest), d, nearest)
+    return nearest
+
+
 def depths(scene: Scene, T_scene_view: NDArray[np.float64], rays: NDArray[np.float64]) -> NDArray[np.float64]:
     """(..., 2) rays (x, y, 1) of a view -> (...) depth at which each first meets the scene, NaN for never."""
     x, y = (np.ascontiguousarray(rays[..., k], np.float64).ravel() for k in (0, 1))

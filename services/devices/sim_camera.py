@@ -29,7 +29,7 @@ from endo3d_core.virtual_rig.light import Light
 from endo3d_core.virtual_rig.motion import Motion
 from endo3d_core.virtual_rig.renderer import Renderer
 
-DEFAULT_SCENE = "contour texture=noise:0.15"
+DEFAULT_SCENE = "contour texture=noise:0.15:0.15"
 
 
 def open_uri(uri: Uri, setting: Setting) -> SimCamera:

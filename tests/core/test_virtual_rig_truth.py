@@ -17,7 +17,7 @@ from endo3d_core.virtual_rig import contour_standard as standard
 from endo3d_core.virtual_rig import motion, scene
 from endo3d_core.virtual_rig.effects import IDEAL
 from endo3d_core.virtual_rig.renderer import Renderer
-from endo3d_core.virtual_rig.truth import Truth, truth
+from endo3d_core.virtual_rig.truth import Truth, distance, truth
 
 HEADS = Path(__file__).parents[2] / "deploy" / "heads"
 NAMES = ("base6_wd10", "base6_wd20", "base35_wd10", "base35_wd20")
@@ -159,3 +159,19 @@ def test_the_renderer_shows_the_true_phase(text: str) -> None:
     # Grey levels and the DMD's pixels leave some mrad; outlines may differ by a step of the table.
     assert np.quantile(np.abs(error[ok]), 0.99) < 0.02
     assert np.abs(np.mean(error[ok])) < 1e-3
+
+
+@pytest.mark.parametrize(
+    "text", ["contour", "plane tilt=20,10", "sphere r=2 + plane z=21", "cylinder r=1.5 turn=0,0,30"]
+)
+def test_distance_is_zero_on_the_surface_and_grows_along_its_normal(text: str) -> None:
+    """True points have no distance; moved 50 um towards the camera they are in front by at most that."""
+    what = scene.parse(text)
+    result, points = seen(text, A_POSE)
+    on = points[np.isfinite(result.depth_mm)]
+    assert np.abs(distance(what, on)).max() < 1e-9
+    towards = A_POSE[:3, 3] - on
+    moved = distance(what, on + 0.05 * towards / np.linalg.norm(towards, axis=1, keepdims=True))
+    assert moved.max() <= 0.05 + 1e-12
+    assert moved.min() > -1e-9
+    assert np.median(moved) > 0.04
