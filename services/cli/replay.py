@@ -108,7 +108,8 @@ def _progress(results: Iterable[Result], start_ns: int, end_ns: int) -> Iterator
     from rich.console import Console
     from rich.progress import Progress
 
-    with Progress(console=Console(stderr=True), transient=True) as bar:
+    console = Console(stderr=True)
+    with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task("replay", total=max(1, end_ns - start_ns))
         for result in results:
             bar.update(task, completed=result.cause.log_ns - start_ns)

@@ -7,6 +7,7 @@ import tempfile
 from collections import Counter, deque
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -67,18 +68,21 @@ def stack_of(log: Log, stack: str | Path | None = None, overrides: Sequence[str]
 
     Raises ``UserError`` when the log carries no stack file and none is given.
     """
+    text = log.attachments.get(STACK_FILE, b"").decode()
+    if stack is not None:
+        described = stack_file.load(stack, overrides)
+    elif text:
+        described = stack_file.loads(text, overrides)
+    else:
+        raise UserError(f"{log.path} carries no stack file; name one with --stack")
+    calibration = log.attachments.get(CALIBRATION_FILE)
+    if calibration is None:
+        yield described
+        return
     with tempfile.TemporaryDirectory(prefix="endo3d-") as folder:
-        calibration = log.attachments.get(CALIBRATION_FILE)
-        if calibration is not None:
-            head = Path(folder) / CALIBRATION_FILE
-            head.write_bytes(calibration)
-            overrides = (f"rig.head={head}", *overrides)
-        if stack is not None:
-            yield stack_file.load(stack, overrides)
-        elif text := log.attachments.get(STACK_FILE, b"").decode():
-            yield stack_file.loads(text, overrides)
-        else:
-            raise UserError(f"{log.path} carries no stack file; name one with --stack")
+        head = Path(folder) / CALIBRATION_FILE
+        head.write_bytes(calibration)
+        yield replace(described, rig=described.rig.model_copy(update={"head": str(head)}))
 
 
 @contextmanager
@@ -87,14 +91,11 @@ def pipeline_of(stack: Stack, only: Collection[str] = ()) -> Iterator[Pipeline]:
 
     Sources, taps and those that write nothing don't: the log takes the sources' place, nobody watches.
     """
-    chosen = [
+    chosen = [stack.entry(name) for name in only] or [
         entry
         for entry in stack.entries
-        if entry.name in only
-        or (not only and entry.kind.reads and entry.kind.writes and not issubclass(entry.kind, Source | Tap))
+        if entry.kind.reads and entry.kind.writes and not issubclass(entry.kind, Source | Tap)
     ]
-    if missing := set(only) - {entry.name for entry in chosen}:
-        raise UserError(f"the stack has no {', '.join(sorted(missing))}; it has {', '.join(stack.tables)}")
     with ExitStack() as closing:
         services = {}
         for entry in chosen:
