@@ -8,6 +8,7 @@ residuals, so each parameter comes with its standard deviation.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -18,6 +19,8 @@ from endo3d_core.calibration import Lens, Rig
 
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
+Size = tuple[int, int]
+"""(width, height) px."""
 
 LENS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
 RIG = ("rx", "ry", "rz", "tx", "ty", "tz")
@@ -68,14 +71,14 @@ def _length_rms(error: NDArray[np.float64]) -> float:
 
 def solve(
     sightings: list[Sighting],
-    camera_size: tuple[int, int],
-    projector_size: tuple[int, int],
+    camera_size: Size,
+    projector_size: Size,
     *,
     fixed: frozenset[str] = frozenset({"camera.k3", "projector.k3"}),
 ) -> Solution:
     """Calibrate from at least three poses of a plane.
 
-    ``fixed`` parameters keep their starting value (distortion terms: zero). Sizes are (width, height) px.
+    ``fixed`` parameters keep their starting value (distortion terms: zero).
     Raises ``ValueError`` when the poses can't determine the rig.
     """
     if len(sightings) < 3:
@@ -116,18 +119,16 @@ def solve(
     )
 
 
-def rig_of(parameters: Vector, camera_size: tuple[int, int], projector_size: tuple[int, int]) -> Rig:
+def rig_of(parameters: Vector, camera_size: Size, projector_size: Size) -> Rig:
     """The rig that the first 24 parameters describe."""
     lenses = []
     for part, size in ((parameters[CAMERA], camera_size), (parameters[PROJECTOR], projector_size)):
         lenses.append(Lens(*size, _K(part), part[4:9]))
     between = parameters[BETWEEN]
-    return Rig(lenses[0], lenses[1], cv2.Rodrigues(between[:3])[0], between[3:])
+    return Rig(lenses[0], lenses[1], _rotation(between[:3]), between[3:])
 
 
-def _start(
-    sightings: list[Sighting], camera_size: tuple[int, int], projector_size: tuple[int, int]
-) -> Vector:
+def _start(sightings: list[Sighting], camera_size: Size, projector_size: Size) -> Vector:
     """Each lens by Zhang's method on its own, and the transform that agrees best between them."""
     board = [s.board_mm.astype(np.float32) for s in sightings]
     flags = cv2.CALIB_FIX_K3
@@ -212,7 +213,9 @@ def _linearise(parameters: Vector, sightings: list[Sighting]) -> tuple[Vector, M
         between = parameters[BETWEEN]
         r3, t3, *derivatives = cv2.composeRT(r, t, between[:3], between[3:])
         dr3dr1, dr3dt1, dr3dr2, dr3dt2, dt3dr1, dt3dt1, dt3dr2, dt3dt2 = derivatives
-        pixels, dpose, dlens = _projection(sighting.board_mm, r3.ravel(), t3.ravel(), parameters[PROJECTOR])
+        pixels, dpose, dlens = _projection(
+            sighting.board_mm, _floats(r3).ravel(), _floats(t3).ravel(), parameters[PROJECTOR]
+        )
         residual[lit] = (pixels - sighting.projector_px).ravel()
         J[lit, pose] = dpose @ np.block([[dr3dr1, dr3dt1], [dt3dr1, dt3dt1]])
         J[lit, BETWEEN] = dpose @ np.block([[dr3dr2, dr3dt2], [dt3dr2, dt3dt2]])
@@ -224,7 +227,15 @@ def _linearise(parameters: Vector, sightings: list[Sighting]) -> tuple[Vector, M
 def _projection(board_mm: Matrix, r: Vector, t: Vector, lens: Vector) -> tuple[Matrix, Matrix, Matrix]:
     """Pixels (n, 2), and their derivatives by the pose (2 n, 6) and by the lens (2 n, 9)."""
     pixels, J = cv2.projectPoints(board_mm, r, t, _K(lens), lens[4:9])
-    return pixels.reshape(-1, 2), J[:, :6], J[:, 6:15]
+    return _floats(pixels).reshape(-1, 2), _floats(J[:, :6]), _floats(J[:, 6:15])
+
+
+def _rotation(vector: Vector) -> Matrix:
+    return _floats(cv2.Rodrigues(vector)[0])
+
+
+def _floats(array: Any) -> NDArray[np.float64]:
+    return np.asarray(array, np.float64)
 
 
 def _K(lens: Vector) -> Matrix:

@@ -14,12 +14,10 @@ TILTS_RAD = [(0.5 * np.cos(a), 0.5 * np.sin(a), 0.1 * a) for a in np.arange(12) 
 
 @pytest.fixture(scope="module")
 def rig() -> Rig:
-    camera = Lens(
-        *CAMERA_SIZE, [[1988.4, 0, 953.4], [0, 1992.2, 603.9], [0, 0, 1]], [-0.127, 0.018, -5e-4, 3e-4, 0]
-    )
-    projector = Lens(
-        *PROJECTOR_SIZE, [[1545.6, 0, 484.7], [0, 1542.1, 476.8], [0, 0, 1]], [-0.088, -0.009, 4e-4, -2e-4, 0]
-    )
+    K_camera = [[1988.4, 0, 953.4], [0, 1992.2, 603.9], [0, 0, 1]]
+    K_projector = [[1545.6, 0, 484.7], [0, 1542.1, 476.8], [0, 0, 1]]
+    camera = Lens(*CAMERA_SIZE, K_camera, [-0.127, 0.018, -5e-4, 3e-4, 0])
+    projector = Lens(*PROJECTOR_SIZE, K_projector, [-0.088, -0.009, 4e-4, -2e-4, 0])
     R = cv2.Rodrigues(np.array([0.005, 0.296, -0.0065]))[0]
     return Rig(camera, projector, R, np.array([-5.93, 0.09, 0.84]))
 
@@ -96,24 +94,13 @@ def test_too_few_poses_are_refused(rig: Rig) -> None:
         solve(sightings(rig, 0.0, 0)[:2], CAMERA_SIZE, PROJECTOR_SIZE)
 
 
-def test_a_board_that_never_tilts_is_refused_or_known_badly(rig: Rig) -> None:
+def test_a_board_that_never_tilts_leaves_the_focal_length_unknown(rig: Rig) -> None:
     flat = []
     for index, sighting in enumerate(sightings(rig, 0.0, 0)[:5]):
         points = sighting.board_mm + np.array([0.0, 0.0, 19.0 + 0.5 * index])
-        rng = np.random.default_rng(index)
-        camera, projector = rig.camera.project(points), rig.projector_pixel(points)
-        flat.append(
-            Sighting(
-                sighting.name,
-                sighting.board_mm,
-                camera + rng.normal(0, 0.05, camera.shape),
-                projector + rng.normal(0, 0.05, projector.shape),
-            )
-        )
+        noise = np.random.default_rng(index).normal(0, 0.05, (2, len(points), 2))
+        camera, projector = rig.camera.project(points) + noise[0], rig.projector_pixel(points) + noise[1]
+        flat.append(Sighting(sighting.name, sighting.board_mm, camera, projector))
     tilted = solve(sightings(rig, 0.05, 1)[:5], CAMERA_SIZE, PROJECTOR_SIZE)
-    try:
-        untilted = solve(flat, CAMERA_SIZE, PROJECTOR_SIZE)
-    except ValueError as refusal:
-        assert "tilt" in str(refusal)
-    else:
-        assert untilted.sigma["camera.fx"] > 10 * tilted.sigma["camera.fx"]
+    untilted = solve(flat, CAMERA_SIZE, PROJECTOR_SIZE)
+    assert untilted.sigma["camera.fx"] > 10 * tilted.sigma["camera.fx"]
