@@ -52,6 +52,7 @@ class Viewer(Service[ViewerConfig]):
         topics.LOG,
     )
     optional = reads
+    newest = (topics.FRAME, topics.CLOUD, topics.DEPTH)
 
     def __init__(self, config: ViewerConfig) -> None:
         super().__init__(config)

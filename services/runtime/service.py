@@ -73,6 +73,8 @@ class Service(Generic[C]):
     reads: ClassVar[tuple[Topic, ...]] = ()
     optional: ClassVar[tuple[Topic, ...]] = ()
     """Those of ``reads`` that need no writer in the stack."""
+    newest: ClassVar[tuple[Topic, ...]] = ()
+    """Those of ``reads`` of which only the newest sample is wanted: older ones are skipped, which is no loss."""
     writes: ClassVar[tuple[Topic, ...]] = ()
     commands: ClassVar[tuple[str, ...]] = ()
     """The verbs ``command`` understands."""

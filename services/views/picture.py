@@ -195,11 +195,13 @@ def _plots(axes: Axes, scan: Scan) -> None:
         return
     start = scan.first_ns or scan.poses[0].stamp_ns
     seconds = np.array([(pose.stamp_ns - start) * 1e-9 for pose in scan.poses])
+    most = 0.0
     for name, label, line in (
         ("residual_um", "residual", figures.COLOURS[0]),
         ("sigma_weak_um", "1-sigma, weakest direction", figures.COLOURS[1]),
     ):
         values = np.array([getattr(pose, name) for pose in scan.poses])
+        most = max(most, spread(values)[1])
         axes.plot(seconds, np.where(values > 0, values, np.nan), color=line, lw=0.9, label=label)
-    axes.set_ylim(bottom=0)
+    axes.set_ylim(0, 1.4 * max(most, 1.0))
     axes.legend(loc="upper right", ncols=2, bbox_to_anchor=(1, 1.16), borderpad=0)

@@ -7,7 +7,6 @@ is added: new entries are counted as lost, and the newest of each path is what i
 
 from __future__ import annotations
 
-import atexit
 import threading
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -106,7 +105,7 @@ class ViewerSink:
             self._recording.disconnect()
         except RuntimeError:
             # rerun's own farewell at exit would wait for the stalled viewer for ever
-            atexit.unregister(rr.rerun_shutdown)
+            rr.unregister_shutdown()
             threading.Thread(target=self._recording.disconnect, daemon=True).start()
 
     def _connect(self) -> None:

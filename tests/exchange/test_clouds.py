@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import trimesh
 from plyfile import PlyData
-from scenes import map_of, points_of
+from scans import map_of, points_of
 
 from endo3d.services.exchange.clouds import write_cloud
 from endo3d.services.exchange.finite import finite

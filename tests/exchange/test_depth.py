@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from scenes import START_NS, messages, points_of, pose_of
+from scans import START_NS, messages, points_of, pose_of
 
 from endo3d.schemas.messages import DepthMap, Pose, Tracking
 from endo3d.services.exchange.depth import write_depth_maps

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
-from scenes import DIST, START_NS, K, messages, points_of, pose_of
+from scans import DIST, START_NS, K, messages, points_of, pose_of
 
 from endo3d.schemas import messages as m
 from endo3d.services.exchange import ros2_types

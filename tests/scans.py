@@ -1,4 +1,4 @@
-"""A small made-up scan with known numbers."""
+"""A small made-up scan with known numbers, for tests of what comes after the scan."""
 
 from __future__ import annotations
 
@@ -54,17 +54,19 @@ def information_of() -> NDArray[np.float64]:
     return np.diag(np.array([2e-3, 3e-3, 5e-3, 1e-4, 2e-4, 4e-4]) ** -2.0)
 
 
-def messages(frames: int = 6) -> Iterator[m.Message]:
-    """What a short simulated run leaves in a log."""
+def messages(
+    frames: int = 6, hz: float = 25.0, shape: tuple[int, int] = (300, 480), start_s: float = 0.0
+) -> Iterator[m.Message]:
+    """What a short simulated run leaves in a log: images of that shape at ``hz``, everything else small."""
     yield m.CameraCalibration(START_NS, 480, 300, K, DIST)
     T_projector_camera = np.eye(4)
     T_projector_camera[0, 3] = -6.0
     yield m.ProjectorCalibration(START_NS, 960, 960, K, DIST, T_projector_camera, "text")
     yield m.Mode(START_NS, "interleaved", "interleaved f1=25", 1, START_NS, 40_000_000, 4000.0, True)
     rng = np.random.default_rng(3)
+    image = rng.integers(0, 256, shape, np.uint8)
     for k in range(frames):
-        stamp_ns = START_NS + 40_000_000 * k
-        image = rng.integers(0, 256, (300, 480), np.uint8)
+        stamp_ns = START_NS + round(1e9 * (start_s + k / hz))
         yield m.Frame(stamp_ns, k, image, "interleaved f1=25", k % 6, 1, 4000.0, stamp_ns - 2_000_000, k)
         points = points_of(k)
         valid = np.isfinite(points["z"])
