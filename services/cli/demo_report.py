@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from dataclasses import asdict
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +14,7 @@ from rich.console import Console
 from rich.table import Table
 
 from endo3d.schemas import topics
+from endo3d.schemas.messages import Message
 from endo3d.services.archive.reader import Log
 from endo3d.services.cli.truth import Comparison, compare
 from endo3d.services.exchange.ply import write_ply
@@ -23,23 +26,22 @@ from endo3d.services.views.scan import Scan
 
 def write(folder: Path, figures: dict[str, Any]) -> dict[str, Any]:
     """Write map.ply, scan.rrd, picture.png and report.json beside the log; all figures of the run."""
-    paths = sorted(folder.glob("scan*.mcap"))
-    if not paths:
+    logs = sorted((Log(path) for path in folder.glob("scan*.mcap")), key=lambda log: log.start_ns)
+    if not logs:
         raise UserError(f"the recorder wrote no log into {folder}; see its lines above")
-    log = Log(paths[0])
-    scan = Scan.of(log.messages())
+    scan = Scan.of(_messages(logs))
     points = scan.points()
     comparison = compare(scan.poses, scan.truths, points)
-    files = {"log": paths[0], "map": folder / "map.ply", "recording": folder / "scan.rrd"}
+    files = {"log": logs[0].path, "map": folder / "map.ply", "recording": folder / "scan.rrd"}
     files["picture"] = folder / "picture.png"
     write_ply(points, files["map"])
-    write_rrd(log.messages(), files["recording"])
+    write_rrd(_messages(logs), files["recording"])
     _picture(scan, files["picture"], comparison)
     report = {
         **figures,
         "simulated": scan.simulated,
         "slow_motion": scan.truths[-1].slow_motion if scan.truths else 1.0,
-        "frames": log.count(topics.FRAME),
+        "frames": sum(log.count(topics.FRAME) for log in logs),
         "rate_hz": (scan.frames - 1) / scan.seconds if scan.seconds else 0.0,
         "poses": len(scan.poses),
         "map_points": len(points),
@@ -50,6 +52,11 @@ def write(folder: Path, figures: dict[str, Any]) -> dict[str, Any]:
     }
     (folder / "report.json").write_text(json.dumps(report, indent=2) + "\n")
     return report
+
+
+def _messages(logs: list[Log]) -> Iterator[Message]:
+    """Of all parts: a recorder that was restarted goes on in a new file."""
+    return chain.from_iterable(log.messages() for log in logs)
 
 
 def _picture(scan: Scan, path: Path, comparison: Comparison | None) -> None:

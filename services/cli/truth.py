@@ -32,12 +32,12 @@ def compare(poses: list[Pose], truths: list[Truth], points: NDArray[Any]) -> Com
 
     The scan's world is laid onto the scene by the trajectory alone; the surface is not fitted.
     """
-    known = {truth.sequence: truth.T_scene_camera for truth in truths}
-    tracked = [pose for pose in poses if pose.sequence in known and pose.state is not Tracking.LOST]
+    known = {truth.stamp_ns: truth.T_scene_camera for truth in truths}
+    tracked = [pose for pose in poses if pose.stamp_ns in known and pose.state is not Tracking.LOST]
     if len(tracked) < 3 or not len(points):
         return None
     estimated = np.stack([pose.T_world_camera for pose in tracked])
-    true = np.stack([known[pose.sequence] for pose in tracked])
+    true = np.stack([known[pose.stamp_ns] for pose in tracked])
     T_scene_world = align(estimated, true)[0] @ rigid.inverse(estimated[0])
     xyz = np.stack([points[axis] for axis in "xyz"], axis=-1).astype(np.float64)
     in_scene = xyz @ T_scene_world[:3, :3].T + T_scene_world[:3, 3]
