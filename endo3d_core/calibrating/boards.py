@@ -1,0 +1,122 @@
+"""Calibration boards: what is printed on them, and where it is seen in an image.
+
+A board is a short text: ``checkerboard 9x7 pitch=1.0``, ``circles 9x7 pitch=1.0``,
+``asymmetric-circles 4x11 pitch=1.0`` or ``charuco 10x8 pitch=1.0 marker=0.75 dictionary=4X4_100``.
+Counts are columns x rows of features (inner corners, circles), for ChArUco of squares; lengths are mm.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from typing import Any, Literal, get_args
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Kind = Literal["checkerboard", "circles", "asymmetric-circles", "charuco"]
+Features = tuple[NDArray[np.float64], NDArray[np.float64]]
+"""Board points (n, 3) mm with z = 0, and where they are seen (n, 2) px."""
+
+
+@dataclass(frozen=True, slots=True)
+class Board:
+    """A printed plane."""
+
+    kind: Kind
+    columns: int
+    rows: int
+    pitch_mm: float
+    marker_mm: float = 0.0
+    dictionary: str = "4X4_100"
+
+    @classmethod
+    def parse(cls, text: str) -> Board:
+        """Text -> board. Raises ``ValueError`` that says what is wrong."""
+        kind, *words = text.split() or [""]
+        if kind not in get_args(Kind):
+            raise ValueError(f"unknown board {text!r}; it starts with one of: {', '.join(get_args(Kind))}")
+        size = re.fullmatch(r"(\d+)x(\d+)", words[0]) if words else None
+        if size is None:
+            raise ValueError(f"board {text!r}: after {kind} comes columns x rows, like 9x7")
+        keys = {"pitch"} | ({"marker", "dictionary"} if kind == "charuco" else set())
+        values = dict(word.partition("=")[::2] for word in words[1:])
+        if set(values) - keys or "pitch" not in values:
+            raise ValueError(f"board {text!r}: it takes {', '.join(sorted(keys))}, and needs pitch=<mm>")
+        try:
+            pitch_mm = float(values["pitch"])
+            marker_mm = float(values.get("marker", 0.75 * pitch_mm))
+        except ValueError:
+            raise ValueError(f"board {text!r}: pitch and marker are lengths in mm") from None
+        columns, rows = int(size[1]), int(size[2])
+        if columns < 3 or rows < 3 or not 0 < marker_mm < pitch_mm < np.inf:
+            raise ValueError(f"board {text!r}: at least 3x3, a positive pitch, markers smaller than it")
+        dictionary = values.get("dictionary", "4X4_100")
+        if not hasattr(cv2.aruco, f"DICT_{dictionary}"):
+            raise ValueError(f"board {text!r}: OpenCV has no marker dictionary {dictionary!r}")
+        return cls(kind, columns, rows, pitch_mm, marker_mm, dictionary)  # type: ignore[arg-type]
+
+    @property
+    def points_mm(self) -> NDArray[np.float64]:
+        """(n, 3) all features in the order that OpenCV finds them, z = 0."""
+        if self.kind == "charuco":
+            return np.asarray(self._charuco().getChessboardCorners(), np.float64)
+        column, row = np.meshgrid(np.arange(self.columns), np.arange(self.rows))
+        if self.kind == "asymmetric-circles":
+            column = 2 * column + row % 2
+        points = np.stack((column.ravel(), row.ravel(), np.zeros(column.size)), axis=1)
+        return np.asarray(points * self.pitch_mm, np.float64)
+
+    def find(self, image: NDArray[np.uint8]) -> Features | None:
+        """Features seen in a (height, width) uint8 image, to a fraction of a pixel; None when there are none.
+
+        Checkerboards and circles are found whole or not at all; ChArUco corners one by one, at least six.
+        """
+        match self.kind:
+            case "checkerboard":
+                return self._find_checkerboard(image)
+            case "charuco":
+                return self._find_charuco(image)
+            case _:
+                return self._find_circles(image)
+
+    def _find_checkerboard(self, image: NDArray[np.uint8]) -> Features | None:
+        flags = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_NORMALIZE_IMAGE
+        found, corners = cv2.findChessboardCornersSB(image, (self.columns, self.rows), flags=flags)
+        return (self.points_mm, _refined(image, _pixels(corners), 0.4)) if found else None
+
+    def _find_circles(self, image: NDArray[np.uint8]) -> Features | None:
+        symmetric = self.kind == "circles"
+        flags = cv2.CALIB_CB_SYMMETRIC_GRID if symmetric else cv2.CALIB_CB_ASYMMETRIC_GRID
+        for shown in (image, 255 - image):  # dark circles, or bright ones
+            found, centres = cv2.findCirclesGrid(
+                shown, (self.columns, self.rows), flags=flags | cv2.CALIB_CB_CLUSTERING
+            )
+            if found:
+                return self.points_mm, _pixels(centres)
+        return None
+
+    def _find_charuco(self, image: NDArray[np.uint8]) -> Features | None:
+        corners, ids, _, _ = cv2.aruco.CharucoDetector(self._charuco()).detectBoard(image)
+        if ids is None or len(ids) < 6:
+            return None
+        clear = (1 - self.marker_mm / self.pitch_mm) / 2  # of a square: where the nearest marker begins
+        return self.points_mm[np.asarray(ids).ravel()], _refined(image, _pixels(corners), clear)
+
+    def _charuco(self) -> Any:
+        dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{self.dictionary}"))
+        return cv2.aruco.CharucoBoard((self.columns, self.rows), self.pitch_mm, self.marker_mm, dictionary)
+
+
+def _pixels(found: Any) -> NDArray[np.float64]:
+    return np.asarray(found, np.float64).reshape(-1, 2)
+
+
+def _refined(image: NDArray[np.uint8], corners: NDArray[np.float64], clear: float) -> NDArray[np.float64]:
+    """Saddle points to about 0.01 px (Foerstner); around each, ``clear`` of a square is free of other edges."""
+    between = np.linalg.norm(corners[:, None] - corners, axis=-1)
+    spacing_px = np.sort(between, axis=1)[:, 1].min()
+    window = max(2, int(clear * spacing_px) - 1)
+    stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 100, 1e-4)
+    return _pixels(cv2.cornerSubPix(image, corners.astype(np.float32), (window, window), (-1, -1), stop))
