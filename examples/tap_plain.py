@@ -8,10 +8,10 @@ import zenoh
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 
 rig = sys.argv[1] if len(sys.argv) > 1 else "demo"
-# A rig's processes meet at three loopback ports that follow from its name.
-port = 20_000 + 3 * (zlib.crc32(rig.encode()) % 3_000)
+# A rig's processes meet at sixteen loopback ports that follow from its name.
+port = 20_000 + 16 * (zlib.crc32(rig.encode()) % 798)
 settings = {
-    "connect/endpoints": [f"tcp/127.0.0.1:{port + i}" for i in range(3)],
+    "connect/endpoints": [f"tcp/127.0.0.1:{port + i}" for i in range(16)],
     "connect/exit_on_failure": False,
     "listen/endpoints": ["tcp/127.0.0.1:0"],
     "scouting/multicast/enabled": False,

@@ -7,6 +7,7 @@ seals it in place, and a reader's message is a view of the very same memory. Whe
 
 from __future__ import annotations
 
+import atexit
 import json
 import logging
 import threading
@@ -28,7 +29,7 @@ from endo3d.services.runtime.errors import UserError
 from endo3d.services.runtime.memory import Memory
 from endo3d.services.runtime.reader import Reader
 from endo3d.services.runtime.service import Exhausted, Refused, Sample, plain_loan
-from endo3d.services.runtime.session import lockable, meeting_port, open_session
+from endo3d.services.runtime.session import lockable, meeting_ports, open_session
 from endo3d.services.runtime.shm_view import View
 from endo3d.services.runtime.tally import Tally
 from endo3d.services.runtime.writer import Writer
@@ -37,8 +38,7 @@ log = logging.getLogger(__name__)
 
 _ASK_AGAIN_S: Final = 0.02
 
-_open_buses: set[Bus] = set()
-"""Of this process: the last one to close tidies up the shared memory."""
+atexit.register(segments.unlink_unused)
 
 Command = Callable[[str, Mapping[str, Any]], Mapping[str, Any]]
 """(verb, parameters) -> reply; raises ``Refused``."""
@@ -61,11 +61,10 @@ class Bus:
         self._writers: dict[str, Writer] = {}
         self._readers: list[Reader] = []
         self._queryables: list[zenoh.Queryable[Any]] = []
-        self._mappings: list[zenoh.Subscriber[None] | zenoh.Queryable[None]] = []
+        self._declared: list[object] = []
         self._tokens: list[zenoh.LivelinessToken] = []
         self._named: set[str] = set()
         self._lock = threading.Lock()
-        _open_buses.add(self)
 
     @classmethod
     def open(
@@ -80,7 +79,7 @@ class Bus:
     ) -> Self:
         """Join a rig's bus as ``name``.
 
-        port: the first of three loopback ports where the rig meets, by default derived from its name.
+        port: the first of the loopback ports where the rig meets; by default it follows from the name.
         shm_mb: what all pools of the rig together may take, and every process must be able to lock.
         settings: zenoh configuration over the built-in one, path -> value.
         Raises ``UserError`` with what to do.
@@ -105,9 +104,7 @@ class Bus:
                     note = f"no zero-copy view in zenoh {version('eclipse-zenoh')}: large messages are copied"
         if note:
             log.warning(note)
-        session = open_session(
-            meeting_port(rig) if port is None else port, shared_memory=shared_memory, settings=settings
-        )
+        session = open_session(meeting_ports(rig, port), shared_memory=shared_memory, settings=settings)
         return cls(rig, name, session, shared_memory, view, note)
 
     def __enter__(self) -> Self:
@@ -131,11 +128,11 @@ class Bus:
     def close(self) -> None:
         """Stop reading, then leave. Arrays that were loaned or received are void from now on."""
         self.stop_reading()
-        self._session.close()
         self._memory = None
-        _open_buses.discard(self)
-        if not _open_buses:
-            segments.unlink_unused()
+        try:
+            self._session.close()
+        except zenoh.ZError as error:  # a connection attempt that hangs
+            log.warning("leaving without waiting: %s", error)
 
     # ---------------------------------------------------------------- messages
 
@@ -184,7 +181,11 @@ class Bus:
     ) -> None:
         """The same with samples as they travelled."""
         if topic.bulk and self._view is not None:
-            self._mappings.append(mapping.map_offered(self._session, mapping.key(self.rig, topic)))
+            self._declared.append(
+                mapping.map_offered(
+                    self._session, mapping.key(self.rig, topic), lambda: self._can_not_map(topic)
+                )
+            )
         reader = Reader(
             self._session, topic.key(self.rig), topic, handler, self._view, self.tally, depth or topic.depth
         )
@@ -258,7 +259,14 @@ class Bus:
             return self._writers[key]
 
     def _offer_pool(self, topic: Topic, piece: zenoh.ZBytes) -> None:
-        self._mappings.append(mapping.offer(self._session, mapping.key(self.rig, topic), piece))
+        self._declared.extend(mapping.offer(self._session, mapping.key(self.rig, topic), piece))
+
+    def _can_not_map(self, topic: Topic) -> None:
+        self.note = (
+            f"{topic.name} does not arrive: its shared memory can't be mapped here; "
+            "check memory locking and /dev/shm (endo3d doctor)"
+        )
+        log.error(self.note)
 
     def _decoded(self, sample: Sample) -> Message | None:
         try:
@@ -281,15 +289,24 @@ def _answer_all(queryable: zenoh.Queryable[Any], handler: Command) -> None:
 def _answer(query: zenoh.Query, handler: Command) -> None:
     verb = _last_part(query.key_expr)
     try:
-        parameters = json.loads(query.payload.to_bytes()) if query.payload else {}
-        reply = handler(verb, parameters)
-    except (Refused, json.JSONDecodeError) as error:
+        reply = handler(verb, _parameters(query.payload))
+    except Refused as error:
         _refuse(query, str(error))
     except Exception as error:
         log.exception("command %s failed", verb)
         _refuse(query, f"{verb} failed: {error}")
     else:
         query.reply(query.key_expr, json.dumps(dict(reply)), encoding=zenoh.Encoding.APPLICATION_JSON)
+
+
+def _parameters(payload: zenoh.ZBytes | None) -> Mapping[str, Any]:
+    try:
+        parameters = json.loads(payload.to_bytes()) if payload else {}
+    except ValueError as error:
+        raise Refused(f"the parameters are no JSON: {error}") from None
+    if not isinstance(parameters, dict):
+        raise Refused("the parameters are a JSON object, name -> value")
+    return parameters
 
 
 def _refuse(query: zenoh.Query, reason: str) -> None:

@@ -1,15 +1,19 @@
 """Readers map a writer's pool before the first frame: mapping and locking it takes up to 80 ms, many frames.
 
-A writer offers a few bytes of each pool: at once to the readers that are there, and on request to later ones.
+A writer shows by a liveliness token that it has a pool, and gives a few bytes of it to who asks. A reader
+that sees the token and gets nothing knows that shared memory does not work between the two: zenoh itself
+would not say so, the frames would just never come.
 """
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 import zenoh
 
 from endo3d.schemas.topics import Topic
 
-_ASK_S = 1.0
+_ASK_S = 2.0
 
 
 def key(rig: str, topic: Topic) -> str:
@@ -17,24 +21,32 @@ def key(rig: str, topic: Topic) -> str:
     return f"endo3d/{rig}/pool/{topic.name}"
 
 
-def offer(session: zenoh.Session, key: str, piece: zenoh.ZBytes) -> zenoh.Queryable[None]:
-    """Let all readers map the pool that ``piece`` is of, now and later."""
+def offer(
+    session: zenoh.Session, key: str, piece: zenoh.ZBytes
+) -> tuple[zenoh.Queryable[None], zenoh.LivelinessToken]:
+    """Let readers map the pool that ``piece`` is of, now and later."""
 
     def answer(query: zenoh.Query) -> None:
         with query:
             query.reply(query.key_expr, piece)
 
-    queryable = session.declare_queryable(key, answer)
-    session.put(key, piece)
-    return queryable
+    return session.declare_queryable(key, answer), session.liveliness().declare_token(key)
 
 
-def map_offered(session: zenoh.Session, key: str) -> zenoh.Subscriber[None]:
-    """Map what is offered now, and from now on whatever comes. Receiving a piece maps its pool."""
-    subscriber = session.declare_subscriber(key, lambda piece: None)
+def map_offered(session: zenoh.Session, key: str, fail: Callable[[], None]) -> zenoh.Subscriber[None]:
+    """Map the pools that are offered, now and from now on; ``fail`` is called when that can't be."""
+
+    def take(token: zenoh.Sample) -> None:
+        if token.kind == zenoh.SampleKind.PUT and not _ask(session, key):
+            fail()
+
+    _ask(session, key)
+    return session.liveliness().declare_subscriber(key, take, history=True)
+
+
+def _ask(session: zenoh.Session, key: str) -> bool:
+    """Receiving a piece maps its pool. Whether any came."""
     pieces = session.get(
         key, target=zenoh.QueryTarget.ALL, consolidation=zenoh.ConsolidationMode.NONE, timeout=_ASK_S
     )
-    for _ in pieces:
-        pass
-    return subscriber
+    return sum(reply.ok is not None for reply in pieces) > 0

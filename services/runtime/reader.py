@@ -54,7 +54,11 @@ class Reader(threading.Thread):
     def run(self) -> None:
         with contextlib.suppress(zenoh.ZError):  # the ring is closed
             for sample in self._subscriber.handler:
-                self._take(sample)
+                try:
+                    self._take(sample)
+                except Exception:
+                    self._tally.drop(self._topic.name, "failed")
+                    log.exception("reading %s goes on after this", self._topic.name)
 
     def close(self) -> None:
         """Ends the thread after the sample it works on."""

@@ -85,6 +85,9 @@ class Runner:
             self._connect()
             self._state = ServiceState.READY
             self._work()
+        except Exception as error:
+            self._state, self._last_failure = ServiceState.FAILED, str(error)
+            raise
         finally:
             self._bus.stop_reading()
             self._service.close()

@@ -19,7 +19,7 @@ _OPEN_FILES = Path("/proc/self/fd")
 def unlink_unused() -> None:
     """Unlink the segments that this process has open and no other process uses.
 
-    Only for a process that is done with shared memory: it gives up its own locks.
+    Only at the end of a process: it gives up its own locks, and zenoh keeps one segment for all its sessions.
     """
     for path, descriptors in _open_segments().items():
         for descriptor in descriptors[1:]:
