@@ -52,12 +52,10 @@ def tap(
     name, port = where(rig)
     if save:
         save.mkdir(parents=True, exist_ok=True)
-    shown = 0
-    for message in reader.tap(topic, rig=name, port=port, timeout_s=timeout_s):
+    for shown, message in enumerate(reader.tap(topic, rig=name, port=port, timeout_s=timeout_s), 1):
         line = json.dumps(plain(message)) if as_json else one_line(message)
         files = saved(message, save) if save else []
         print(line, *(f"-> {path}" for path in files), flush=True)
-        shown += 1
         if shown == count:
             return
     raise UserError(f"nothing on {topic.key(name)} for {timeout_s:g} s; endo3d top shows who is there")
