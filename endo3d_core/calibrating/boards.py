@@ -114,7 +114,7 @@ def _pixels(found: Any) -> NDArray[np.float64]:
 
 
 def _refined(image: NDArray[np.uint8], corners: NDArray[np.float64], clear: float) -> NDArray[np.float64]:
-    """Saddle points to about 0.01 px (Foerstner); around each, ``clear`` of a square is free of other edges."""
+    """Saddle points to about 0.01 px; ``clear`` of a square around each is free of other edges."""
     between = np.linalg.norm(corners[:, None] - corners, axis=-1)
     spacing_px = np.sort(between, axis=1)[:, 1].min()
     window = max(2, int(clear * spacing_px) - 1)
