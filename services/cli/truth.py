@@ -12,7 +12,7 @@ from endo3d.schemas.messages import Pose, Tracking, Truth
 from endo3d_core import rigid
 from endo3d_core.metrology import SurfaceError, surface_error
 from endo3d_core.trajectory import TrajectoryError, align, ate
-from endo3d_core.virtual_rig import scene
+from endo3d_core.virtual_rig import scene, truth
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ def compare(poses: list[Pose], truths: list[Truth], points: NDArray[Any]) -> Com
 
     The scan's world is laid onto the scene by the trajectory alone; the surface is not fitted.
     """
-    known = {truth.stamp_ns: truth.T_scene_camera for truth in truths}
+    known = {known_pose.stamp_ns: known_pose.T_scene_camera for known_pose in truths}
     tracked = [pose for pose in poses if pose.stamp_ns in known and pose.state is not Tracking.LOST]
     if len(tracked) < 3 or not len(points):
         return None
@@ -41,10 +41,11 @@ def compare(poses: list[Pose], truths: list[Truth], points: NDArray[Any]) -> Com
     T_scene_world = align(estimated, true)[0] @ rigid.inverse(estimated[0])
     xyz = np.stack([points[axis] for axis in "xyz"], axis=-1).astype(np.float64)
     in_scene = xyz @ T_scene_world[:3, :3].T + T_scene_world[:3, 3]
-    distance = scene.parse(truths[0].scene).distance
+    true_scene = scene.parse(truths[0].scene)
+    distance_mm = truth.distance(true_scene, in_scene)
     return Comparison(
         ate(estimated, true),
         1.0 - len(tracked) / len(poses),
-        surface_error(in_scene, distance),
-        1e3 * np.asarray(distance(in_scene)),
+        surface_error(in_scene, lambda _: distance_mm),
+        1e3 * distance_mm,
     )
