@@ -12,16 +12,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from endo3d_core import rigid
-from endo3d_core.registration import NormalEquations
+from endo3d_core.registration import Frame6, NormalEquations
 
 Array = NDArray[np.float64]
 
 WEAK = 0.1
 """Geometry with a larger 1-sigma than this, in point sigmas, asks the texture for help."""
-HELD = 3.0
-"""A direction with a larger 1-sigma than this, in point sigmas, is not moved at all."""
-TEXTURE_SNR = 1.4
-"""Energy of the texture's slope along a direction, over what its grey noise alone would make."""
+HELD = 1.0
+"""A direction that is known no better than a single point, 1-sigma in point sigmas, is not moved at all."""
+REPEATED = 1.0 - 1.0 / 1.4
+"""Least share of the cloud's texture gradients along a direction that the map shows too: their energy is then 1.4
+times that of their noise. Less is mostly shading, which moves with the camera."""
+SIGNIFICANT = 5.0
+"""The least agreement, in standard deviations of what chance would give."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +53,7 @@ def solve(n: NormalEquations, sigma_mm: float) -> Solution:
     weak = vectors[:, values < 1.0 / (WEAK * sigma_mm) ** 2]
     textured = _textured_directions(n, weak)
     P = textured @ textured.T
-    texture = P @ (n.texture - n.texture_noise) @ P
+    texture = P @ n.texture @ P
     # More spread than the points' sigma says (model errors) makes every estimate that much less certain.
     excess = max(1.0, n.residual_mm / sigma_mm) ** 2
     information = (geometry + texture) / excess
@@ -73,32 +76,35 @@ def solve(n: NormalEquations, sigma_mm: float) -> Solution:
 
 
 def _textured_directions(n: NormalEquations, weak: Array) -> Array:
-    """(6, k) orthonormal directions among ``weak`` in which the texture's slopes stand out of their noise."""
+    """(6, k) orthonormal directions among ``weak`` along which map and cloud show the same texture."""
     if weak.size == 0 or n.textured == 0:
         return np.zeros((6, 0))
     _, mixed = np.linalg.eigh(weak.T @ n.texture @ weak)
     directions = weak @ mixed
-    energy = np.einsum("ik,ij,jk->k", directions, n.texture, directions)
-    noise = np.einsum("ik,ij,jk->k", directions, n.texture_noise, directions)
-    chosen: Array = directions[:, energy > TEXTURE_SNR * noise]
+    common, of_map, of_live = (
+        np.einsum("ik,ij,jk->k", directions, information, directions)
+        for information in (n.texture, n.texture_map, n.texture_live)
+    )
+    by_chance = np.sqrt(of_map * of_live / n.textured)
+    chosen: Array = directions[:, (common > REPEATED * of_live) & (common > SIGNIFICANT * by_chance)]
     return chosen
 
 
-def motion(step: Array, centre: Array, radius_mm: float) -> Array:
+def motion(step: Array, frame: Frame6) -> Array:
     """The step (6,) as the camera's motion T_before_after (4, 4)."""
-    twist = np.concatenate([step[:3], step[3:] / radius_mm])
-    return rigid.translation(centre) @ rigid.exp(twist) @ rigid.translation(-centre)
+    twist = np.concatenate([step[:3], step[3:] / frame.radius_mm])
+    return rigid.translation(frame.centre) @ rigid.exp(twist) @ rigid.translation(-frame.centre)
 
 
-def scaled_twist(T: Array, centre: Array, radius_mm: float) -> Array:
+def scaled_twist(T: Array, frame: Frame6) -> Array:
     """The inverse of ``motion``."""
-    twist = rigid.log(rigid.translation(-centre) @ T @ rigid.translation(centre))
-    return np.concatenate([twist[:3], radius_mm * twist[3:]])
+    twist = rigid.log(rigid.translation(-frame.centre) @ T @ rigid.translation(frame.centre))
+    return np.concatenate([twist[:3], frame.radius_mm * twist[3:]])
 
 
-def at_camera(information: Array, centre: Array, radius_mm: float) -> Array:
+def at_camera(information: Array, frame: Frame6) -> Array:
     """(6, 6) information of (translation mm, rotation rad) of the camera's own origin."""
-    scale = np.diag([1.0, 1.0, 1.0, radius_mm, radius_mm, radius_mm])
-    A = scale @ rigid.adjoint(rigid.translation(-centre))
+    scale = np.diag([1.0, 1.0, 1.0, frame.radius_mm, frame.radius_mm, frame.radius_mm])
+    A = scale @ rigid.adjoint(rigid.translation(-frame.centre))
     out: Array = A.T @ information @ A
     return out

@@ -35,8 +35,6 @@ class LiveView:
         self.pitch_mm = np.nan
         """Typical distance of neighbouring pooled points."""
 
-        self.texture_sigma = np.nan
-        """1-sigma of the pooled texture's noise."""
 
     def load(self, channels: NDArray[np.float32]) -> int:
         """(height, width, 6) float32 x y z intensity quality sigma -> the number of valid pooled cells.
@@ -53,14 +51,15 @@ class LiveView:
         pooling.high_pass(self._planes, half, self._work)
         self.pitch_mm = POOL * pitch_mm
         normals.slopes(self._planes[pooling.Z], 2 * STEEPEST * self.pitch_mm, self._slopes)
-        normals.gather(self._planes, self._slopes, self.coefficients, self.live)
+        grey = float(np.nanmedian(self._planes[pooling.INTENSITY, ::5, ::5]))
+        normals.gather(self._planes, self._slopes, self.coefficients, grey, self.live)
         self.sigma_mm = float(np.nanmedian(self._planes[pooling.SIGMA, ::5, ::5]))
-        self.texture_sigma = grey_noise(channels[..., 3]) / POOL
         self.depth_mm = float(np.nanmedian(self._planes[pooling.Z, ::5, ::5]))
         return self.count
 
-    def normal_sigma(self) -> float:
-        """1-sigma (rad) of a normal's tilt from this one cloud."""
+    @property
+    def normal_rad(self) -> float:
+        """1-sigma of a normal's tilt from this one cloud."""
         return float(np.sqrt(normals.SLOPE_VARIANCE)) * self.sigma_mm / self.pitch_mm
 
     def _learn_rays(self, channels: NDArray[np.float32]) -> None:
@@ -84,20 +83,3 @@ class LiveView:
         depth = depth[np.isfinite(depth)]
         return float(np.median(depth)) if depth.size else 1.0
 
-
-def grey_noise(grey: NDArray[np.float32], stride: int = 5) -> float:
-    """Relative 1-sigma of the noise of an image (height, width), NaN where invalid.
-
-    The difference of two Laplacians is blind to anything locally quadratic (Immerkaer, Computer Vision and Image
-    Understanding 64:300, 1996); the median is blind to edges. Detail finer than a cell counts as noise.
-    """
-    h, w = grey.shape
-    rows, columns = slice(1, h - 1, stride), slice(1, w - 1, stride)
-    up, down = slice(0, h - 2, stride), slice(2, h, stride)
-    left, right = slice(0, w - 2, stride), slice(2, w, stride)
-    corners = grey[up, left] + grey[up, right] + grey[down, left] + grey[down, right]
-    sides = grey[up, columns] + grey[down, columns] + grey[rows, left] + grey[rows, right]
-    response = np.abs(corners - 2.0 * sides + 4.0 * grey[rows, columns])
-    level = np.nanmedian(grey[rows, columns])
-    # 6 = root of the sum of the squared mask; 0.6745 = median of |N(0, 1)|.
-    return float(np.nanmedian(response) / (6.0 * 0.6745 * max(level, 1e-6)))

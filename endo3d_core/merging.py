@@ -27,12 +27,12 @@ MAP_POINT = np.dtype(
 values, sigma in mm (standard deviation of the measured points along the normal; that of the mean is
 sigma / sqrt(count)), measured points, sequence numbers of the first and last cloud, voxel key."""
 
-# A row is one cache line: 16 float32, seen as int32 and int16 too.
-POS, NORMAL, GREY, VARIANCE, WEIGHT, TEXTURE = 0, 3, 6, 7, 8, 9
-COUNT, FIRST, LAST = 10, 11, 12  # int32
-KEY_X, KEY_Y, KEY_Z, PUBLISHED = 26, 27, 28, 29  # int16
-MOVED = 15
+# A row is one cache line: 16 float32, seen as int32 too. Beside it lies a tag of four int16.
+POS, NORMAL, GREY, VARIANCE, WEIGHT, TEXTURE, GRADIENT = 0, 3, 6, 7, 8, 9, 10
+COUNT, FIRST, LAST = 13, 14, 15  # int32
 ROW = 16
+KEY, PUBLISHED = 0, 3  # of the tag
+TAG = 4
 
 CONFIRMED = 4
 """Measured points from which on a map point is believed and published."""
@@ -41,6 +41,7 @@ _OUTLIER_AGE = 60
 _SWEPT = 4096
 """Rows looked at for eviction per cloud: a fixed cost instead of a pause."""
 _MOVED_MM = 0.002
+"""A published point is published again when its mean has moved so far along the normal."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +55,7 @@ class Delta:
 
 
 class MergedMap:
-    """Points of ``capacity`` voxels of ``merging_distance_mm``; memory is bounded by 96 bytes for each."""
+    """Points of ``capacity`` voxels of ``merging_distance_mm``; memory is bounded by about 120 bytes for each."""
 
     def __init__(self, merging_distance_mm: float = 0.075, capacity: int = 1_000_000) -> None:
         if not 0.001 <= merging_distance_mm <= 10.0:
@@ -66,7 +67,8 @@ class MergedMap:
         self._index = np.zeros(slots, np.int32)
         self.rows = np.zeros((capacity, ROW), np.float32)
         self.ints = self.rows.view(np.int32)
-        self._shorts = self.rows.view(np.int16)
+        self._tags = np.zeros((capacity, TAG), np.int16)
+        self._moved = np.zeros(capacity, np.float32)
         self._free = np.empty(capacity, np.int32)
         self._dirty = np.empty(capacity, np.int32)
         self._removed = np.empty((capacity, 3), np.int16)
@@ -106,11 +108,11 @@ class MergedMap:
             self._touched = np.empty(live.shape[0] * live.shape[1], np.int32)
         _merge(
             live, np.ascontiguousarray(T_world_camera, np.float64), self.merging_distance_mm, sequence,
-            self._keys, self._index, self.rows, self.ints, self._shorts,
+            self._keys, self._index, self.rows, self.ints, self._tags, self._moved,
             self._free, self._dirty, self._touched, self._counters,
         )  # fmt: skip
         _sweep(
-            sequence, min(_SWEPT, self.used), self._keys, self._index, self.ints, self._shorts,
+            sequence, min(_SWEPT, self.used), self._keys, self._index, self.ints, self._tags,
             self._free, self._removed, self._counters,
         )  # fmt: skip
 
@@ -127,20 +129,20 @@ class MergedMap:
         dirty = self._dirty[: self._counters[2]]
         dirty = dirty[self.ints[dirty, COUNT] >= CONFIRMED]
         delta = Delta(self._published(dirty), self._removed[: self._counters[3]].copy())
-        _mark_published(dirty, self.rows, self.ints, self._shorts)
+        _mark_published(dirty, self.ints, self._tags, self._moved)
         self._counters[2:4] = 0
         return delta
 
     def _published(self, rows: NDArray[np.int32]) -> NDArray[np.void]:
         out = np.zeros(len(rows), MAP_POINT)
-        values, ints, shorts = self.rows[rows], self.ints[rows], self._shorts[rows]
+        values, ints, tags = self.rows[rows], self.ints[rows], self._tags[rows]
         for i, name in enumerate(("x", "y", "z", "nx", "ny", "nz", "intensity")):
             out[name] = values[:, i]
         out["sigma"] = np.sqrt(values[:, VARIANCE])
         for i, name in enumerate(("count", "first_seen", "last_seen")):
             out[name] = ints[:, COUNT + i]
         for i, name in enumerate(("kx", "ky", "kz")):
-            out[name] = shorts[:, KEY_X + i]
+            out[name] = tags[:, KEY + i]
         return out
 
 
@@ -162,7 +164,7 @@ def _along_axis(keys, index, rows, kx, ky, kz, axis, place, d):  # type: ignore[
 
 @kernel
 def _merge(  # type: ignore[no-untyped-def]
-    live, T, d, sequence, keys, index, rows, ints, shorts, free, dirty, touched, counters
+    live, T, d, sequence, keys, index, rows, ints, tags, moved, free, dirty, touched, counters
 ):
     r00, r01, r02, tx = np.float32(T[0, 0]), np.float32(T[0, 1]), np.float32(T[0, 2]), np.float32(T[0, 3])
     r10, r11, r12, ty = np.float32(T[1, 0]), np.float32(T[1, 1]), np.float32(T[1, 2]), np.float32(T[1, 3])
@@ -206,12 +208,13 @@ def _merge(  # type: ignore[no-untyped-def]
                 voxel_hash.insert(keys, index, key, row)
                 rows[row] = np.float32(0.0)
                 rows[row, 0], rows[row, 1], rows[row, 2] = x, y, z
-                shorts[row, KEY_X], shorts[row, KEY_Y], shorts[row, KEY_Z] = kx, ky, kz
+                tags[row, 0], tags[row, 1], tags[row, 2], tags[row, PUBLISHED] = kx, ky, kz, 0
+                moved[row] = np.float32(0.0)
                 ints[row, FIRST] = sequence
                 ints[row, LAST] = sequence - 1
             point = rows[row]
-            point[WEIGHT] += p[9]
-            share = p[9] / point[WEIGHT]
+            point[WEIGHT] += p[10]
+            share = p[10] / point[WEIGHT]
             dx, dy, dz = x - point[0], y - point[1], z - point[2]
             point[0] += share * dx
             point[1] += share * dy
@@ -227,36 +230,40 @@ def _merge(  # type: ignore[no-untyped-def]
                 point[3], point[4], point[5] = nx * scale, ny * scale, nz * scale
             off = point[3] * dx + point[4] * dy + point[5] * dz
             point[VARIANCE] = (one - share) * (point[VARIANCE] + share * off * off)
-            point[MOVED] += share * off
-            point[GREY] += share * (p[10] - point[GREY])
+            moved[row] += share * off
+            point[GREY] += share * (p[11] - point[GREY])
             point[TEXTURE] += share * (p[6] - point[TEXTURE])
+            if p[7] == p[7]:
+                point[10] += share * (r00 * p[7] + r01 * p[8] + r02 * p[9] - point[10])
+                point[11] += share * (r10 * p[7] + r11 * p[8] + r12 * p[9] - point[11])
+                point[12] += share * (r20 * p[7] + r21 * p[8] + r22 * p[9] - point[12])
             ints[row, COUNT] += 1
             if ints[row, LAST] != sequence:
                 ints[row, LAST] = sequence
                 touched[counters[4]] = row
                 counters[4] += 1
             # Published holds twice the exponent of the last published count, plus one while the row waits.
-            state = np.int64(shorts[row, PUBLISHED])
+            state = np.int64(tags[row, PUBLISHED])
             if (state & 1) == 0 and ints[row, COUNT] >= CONFIRMED:
-                if (ints[row, COUNT] >> (state >> 1)) > 1 or abs(point[MOVED]) > np.float32(_MOVED_MM) or state == 0:
-                    shorts[row, PUBLISHED] = state | 1
+                if (ints[row, COUNT] >> (state >> 1)) > 1 or abs(moved[row]) > np.float32(_MOVED_MM) or state == 0:
+                    tags[row, PUBLISHED] = state | 1
                     dirty[counters[2]] = row
                     counters[2] += 1
 
 
 @kernel
-def _mark_published(dirty, rows, ints, shorts):  # type: ignore[no-untyped-def]
+def _mark_published(dirty, ints, tags, moved):  # type: ignore[no-untyped-def]
     for i in range(dirty.size):
         row = dirty[i]
         exponent = 0
         while (ints[row, COUNT] >> (exponent + 1)) > 0:
             exponent += 1
-        shorts[row, PUBLISHED] = 2 * exponent
-        rows[row, MOVED] = np.float32(0.0)
+        tags[row, PUBLISHED] = 2 * exponent
+        moved[row] = np.float32(0.0)
 
 
 @kernel
-def _sweep(sequence, amount, keys, index, ints, shorts, free, removed, counters):  # type: ignore[no-untyped-def]
+def _sweep(sequence, amount, keys, index, ints, tags, free, removed, counters):  # type: ignore[no-untyped-def]
     """Looks at the next ``amount`` rows and evicts those that were never confirmed (section 3.3: outliers)."""
     used = counters[0]
     for _ in range(amount):
@@ -265,7 +272,7 @@ def _sweep(sequence, amount, keys, index, ints, shorts, free, removed, counters)
         if 0 < ints[row, COUNT] < CONFIRMED and sequence - ints[row, LAST] > _OUTLIER_AGE:
             voxel_hash.remove(
                 keys, index,
-                voxel_hash.pack(np.int64(shorts[row, KEY_X]), np.int64(shorts[row, KEY_Y]), np.int64(shorts[row, KEY_Z])),
+                voxel_hash.pack(np.int64(tags[row, 0]), np.int64(tags[row, 1]), np.int64(tags[row, 2])),
             )  # fmt: skip
             ints[row, COUNT] = 0
             free[counters[1]] = row

@@ -14,12 +14,11 @@ from endo3d_core.compiled import kernel
 
 SLOPE_VARIANCE = 1.0 / 50.0
 """Variance of the 5x5 regression's slope, in cell variances per cell^2."""
-TEXTURE_SLOPE_VARIANCE = 1.0 / 6.0
-"""The same of the texture's 3x3 regression."""
-
-LIVE = 12
-"""Columns of ``live``: x y z, normal towards the camera, texture, its slope per column and per row, 1/sigma^2,
-intensity, and one to fill 48 bytes."""
+LIVE = 16
+"""Columns of ``live``, see the indices below."""
+POINT, NORMAL, TEXTURE, GRADIENT, WEIGHT, GREY, TEXTURE_WEIGHT = 0, 3, 6, 7, 10, 11, 12
+"""x y z; normal towards the camera; texture and its gradient per mm in the camera's axes; 1/sigma^2 of the depth;
+intensity; the square of the surroundings' brightness, relative to the whole cloud's."""
 
 
 @kernel
@@ -81,35 +80,47 @@ def gather(
     planes: NDArray[np.float32],
     slope: NDArray[np.float32],
     coefficients: NDArray[np.float32],
+    grey: float,
     live: NDArray[np.float32],
 ) -> None:
     """planes (6, rows, columns) of ``pooling`` and slopes (2, rows, columns) -> live (rows, columns, LIVE).
 
-    ``coefficients`` (2, 5) are the pooled grid's rays. The normal is NaN where the slope is.
+    ``coefficients`` (2, 5) are the pooled grid's rays, ``grey`` the cloud's typical intensity. The normal is NaN
+    where the slope is, the gradient where a neighbour is missing.
     """
-    rows, columns = planes.shape[1], planes.shape[2]
+    columns = planes.shape[2]
     texture = planes[4]
     one, three, sixth, nan = np.float32(1.0), np.float32(3.0), np.float32(1.0 / 6.0), np.float32(np.nan)
+    per_grey = np.float32(1.0 / max(grey, 1e-6))
     ax, ak, by, bk = coefficients[0, 1], coefficients[0, 3], coefficients[1, 2], coefficients[1, 4]
-    for r in range(rows):
+    for r in range(planes.shape[1]):
         for c in range(columns):
             point = live[r, c]
             z, z_u, z_v = planes[2, r, c], slope[0, r, c], slope[1, r, c]
             point[0], point[1], point[2] = planes[0, r, c], planes[1, r, c], z
-            point[6], point[9], point[10] = texture[r, c], one / (planes[5, r, c] * planes[5, r, c]), planes[3, r, c]
+            sigma = planes[5, r, c]
+            point[6], point[10], point[11] = texture[r, c], one / (sigma * sigma), planes[3, r, c]
             if not (z == z and z_u == z_u):
-                point[3] = point[4] = point[5] = point[7] = point[8] = nan
+                for k in (3, 4, 5, 7, 8, 9):
+                    point[k] = nan
                 continue
             # Cells per unit of x/z here: the fitted rays' Jacobian, its small cross terms left out.
-            x, y = point[0] / z, point[1] / z
+            x, y, per_z = point[0] / z, point[1] / z, one / z
             fx, fy = ax + ak * (three * x * x + y * y), by + bk * (x * x + three * y * y)
-            # Tangents: z_u (x, y, 1) + (z / fx, 0, 0) along the row, z_v (x, y, 1) + (0, z / fy, 0) along the column.
-            nx, ny = z_u * fx / z, z_v * fy / z
+            # Tangents: z_u (x, y, 1) + (z / fx, 0, 0) along the row, z_v (x, y, 1) + (0, z / fy, 0) down the column.
+            nx, ny = z_u * fx * per_z, z_v * fy * per_z
             nz = -(one + x * nx + y * ny)
             scale = one / np.sqrt(nx * nx + ny * ny + nz * nz)
             point[3], point[4], point[5] = nx * scale, ny * scale, nz * scale
             before, here, after = texture[r - 1], texture[r], texture[r + 1]
             right = before[c + 1] + here[c + 1] + after[c + 1]
             left = before[c - 1] + here[c - 1] + after[c - 1]
-            point[7] = sixth * (right - left)
-            point[8] = sixth * (after[c - 1] + after[c] + after[c + 1] - before[c - 1] - before[c] - before[c + 1])
+            t_u = sixth * (right - left) * fx * per_z
+            t_v = sixth * (after[c - 1] + after[c] + after[c + 1] - before[c - 1] - before[c] - before[c + 1])
+            t_v *= fy * per_z
+            # A missing neighbour makes one of the two NaN, and the sum makes it all three.
+            missing = np.float32(0.0) * (t_u + t_v)
+            point[7], point[8], point[9] = t_u + missing, t_v + missing, -(x * t_u + y * t_v)
+            # Grey noise g makes texture noise g / surroundings.
+            surroundings = point[11] / (one + point[6]) * per_grey
+            point[12] = surroundings * surroundings

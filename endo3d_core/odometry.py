@@ -11,16 +11,20 @@ from numpy.typing import NDArray
 from endo3d_core import health, rigid
 from endo3d_core.live_view import LiveView
 from endo3d_core.merging import MergedMap
-from endo3d_core.registration import Linearisation, visible_surface
+from endo3d_core.registration import Frame6, Linearisation, Scales, visible_surface
 
 Array = NDArray[np.float64]
 
 ITERATIONS = 4
-_CONVERGED = 0.02
-"""A step smaller than this, in point sigmas, ends the iteration."""
+_CONVERGED = 0.1
+"""A step smaller than this, in point sigmas, ends the iteration: the next would be far smaller still."""
+_COARSE = 4
+"""The first iteration only has to take in what the prediction missed: every fourth map point does."""
 _LEAST_SHARE = 0.35
 """Of the visible map points that must agree with the cloud."""
 _LEAST_POINTS = 300
+_LEAST_TEXTURE = 0.001
+"""Relative brightness: far below any camera's noise, it keeps the robust scale from being zero."""
 _LONGEST_GAP = 6.0
 """After a gap of more than so many periods the last velocity says nothing about a hand."""
 
@@ -100,39 +104,30 @@ class Odometry:
 
     def _register(self, predicted: Array, stamp_ns: int) -> Estimate:
         view, sigma_mm = self.view, self.view.sigma_mm
-        centre, radius_mm = visible_surface(view.live)
-        T = predicted
-        rows = self.map.touched
-        photometric = True
-        # The first iteration has to take in what the prediction missed; then the residuals set the scales.
+        frame = visible_surface(view.live)
+        T, rows = predicted, self.map.touched
         gate_mm = 8.0 * self._scale_mm + view.pitch_mm
-        scale_mm, texture_scale = 0.5 * gate_mm, 4.0 * self._texture_scale
-        for _ in range(ITERATIONS):
-            n = self._equations.at(
-                T, self.map, rows, view.live, view.coefficients, centre=centre, radius_mm=radius_mm, gate_mm=gate_mm,
-                scale_mm=scale_mm, texture_scale=texture_scale,
-                texture_sigma=view.texture_sigma, normal_sigma=view.normal_sigma(),
-                photometric=photometric,
-            )  # fmt: skip
+        scales = Scales(gate_mm, 0.5 * gate_mm, 4.0 * self._texture_scale, view.normal_rad)
+        for iteration in range(ITERATIONS):
+            chosen = rows if iteration else rows[::_COARSE]
+            n = self._equations.at(T, self.map, chosen, view.live, view.coefficients, frame, scales)
             if n.used < _LEAST_POINTS:
-                break
+                return self._lost(0.0, np.nan)
             solution = health.solve(n, sigma_mm)
-            T = T @ health.motion(solution.step, centre, radius_mm)
+            T = T @ health.motion(solution.step, frame)
             scale_mm = max(n.residual_mm, sigma_mm)
-            if n.textured:
-                texture_scale = max(n.texture_residual, view.texture_sigma)
-            gate_mm = 8.0 * scale_mm
-            if np.linalg.norm(solution.step) < _CONVERGED * sigma_mm:
+            scales = Scales(8.0 * scale_mm, scale_mm, max(n.texture_residual, _LEAST_TEXTURE), view.normal_rad)
+            if iteration and np.linalg.norm(solution.step) < _CONVERGED * sigma_mm:
                 break
         share = n.used / max(n.visible, 1)
-        if n.used < _LEAST_POINTS or share < _LEAST_SHARE:
+        if share < _LEAST_SHARE:
             return self._lost(share, n.residual_mm)
-        self._scale_mm, self._texture_scale = min(scale_mm, 4.0 * sigma_mm), texture_scale
+        self._scale_mm, self._texture_scale = min(scale_mm, 4.0 * sigma_mm), scales.texture
         T = rigid.orthonormal(T)
-        self._advance(T, stamp_ns, solution.held, centre, radius_mm)
+        self._advance(T, stamp_ns, solution.held, frame)
         return Estimate(
             T_world_camera=T,
-            information=health.at_camera(solution.information, centre, radius_mm),
+            information=health.at_camera(solution.information, frame),
             state=State.DEGENERATE if solution.held.size else State.TRACKING,
             sigma_weak_mm=solution.sigma_weak_mm,
             weak_direction=solution.weak_direction,
@@ -148,11 +143,11 @@ class Odometry:
             self.T_world_camera, np.zeros((6, 6)), State.LOST, np.inf, np.zeros(6), share, residual_mm, 0.0, self.submap
         )
 
-    def _advance(self, T: Array, stamp_ns: int, held: Array, centre: Array, radius_mm: float) -> None:
+    def _advance(self, T: Array, stamp_ns: int, held: Array, frame: Frame6) -> None:
         """The new pose, and the velocity for the next prediction: none along held directions."""
         assert self._last_ns is not None
-        moved = health.scaled_twist(rigid.inverse(self.T_world_camera) @ T, centre, radius_mm)
+        moved = health.scaled_twist(rigid.inverse(self.T_world_camera) @ T, frame)
         moved -= held @ (held.T @ moved)
         self._period_ns = max(stamp_ns - self._last_ns, 1)
-        self._velocity = rigid.log(health.motion(moved, centre, radius_mm)) / self._period_ns
+        self._velocity = rigid.log(health.motion(moved, frame)) / self._period_ns
         self.T_world_camera, self._last_ns = T, stamp_ns

@@ -1,8 +1,8 @@
 """Projective registration of a cloud to the visible part of the merged map (sections 3.3 and 5 of the paper).
 
 Map points are projected into the organised grid, which replaces the closest-point search of ICP. Rows are
-point-to-plane, weighted by variance, observation count and robustly; in directions where the geometry is weak,
-rows of the texture (``photometric``) join in.
+point-to-plane, weighted by variance, by observation count and robustly. Photometric rows compare the texture; they
+are meant for directions in which the geometry is weak (``health`` decides).
 
 The unknown is a small motion of the camera in its own axes, about the centre of the visible surface, with the
 rotation scaled by the surface's radius: all six numbers are mm and comparable.
@@ -17,15 +17,9 @@ from numpy.typing import NDArray
 
 from endo3d_core import rigid
 from endo3d_core.compiled import kernel
-from endo3d_core.merging import COUNT, TEXTURE, MergedMap
-from endo3d_core.normals import TEXTURE_SLOPE_VARIANCE
+from endo3d_core.merging import COUNT, MergedMap
 
 Array = NDArray[np.float64]
-
-_VISIBLE, _USED, _SQUARES, _WEIGHTS = 0, 1, 2, 3
-_TEXTURED, _TEXTURE_SQUARES, _TEXTURE_WEIGHTS = 4, 5, 6
-_NOISE_WEIGHT = 7
-_STATISTICS = 8
 
 SAME_SURFACE = 0.8
 """Least cosine between the normals of a pair (37 deg)."""
@@ -34,149 +28,185 @@ GRAZING = 0.3
 FACING = 0.9
 """Least view cosine of a photometric row: on flanks, shading changes with the pose."""
 
+_SURFACE_ROWS = 11
+"""J (6), distance, then 1 and the scaled position (3) weighted with the noise of the normal."""
+_TEXTURE_ROWS = 13
+"""J with the map's gradient (6), with the cloud's (6), difference."""
 
-@dataclass(slots=True)
+
+@dataclass(frozen=True, slots=True)
+class Frame6:
+    """What a small motion is expressed in."""
+
+    centre: Array
+    """(3,) mm in camera axes: what rotations are about."""
+    radius_mm: float
+    """What turns radians into mm: the rms radius of the visible surface."""
+
+
+@dataclass(frozen=True, slots=True)
+class Scales:
+    """What counts as near, in this iteration."""
+
+    gate_mm: float
+    """Farther points are no pairs."""
+    distance_mm: float
+    """Robust scale of distances."""
+    texture: float
+    """Robust scale of differences in texture."""
+    normal_rad: float
+    """1-sigma tilt of one cloud's normals."""
+
+
+@dataclass(frozen=True, slots=True)
 class NormalEquations:
-    """Normal equations of one linearisation: information, gradient and what the rows were like."""
+    """Information, gradient and what the rows were like. Matrices are (6, 6), gradients (6,)."""
 
     geometry: Array
     geometry_gradient: Array
-    texture: Array
-    texture_gradient: Array
     geometry_noise: Array
     """The part of ``geometry`` that noisy normals alone would make."""
-    texture_noise: Array
-    """The part of ``texture`` that grey noise alone would make."""
+    texture: Array
+    """Of the gradients that map and cloud agree on: noise, independent in the two, cancels."""
+    texture_gradient: Array
+    texture_map: Array
+    """Of the map's gradients alone: more than ``texture`` by the map's noise."""
+    texture_live: Array
+    """Of the cloud's gradients alone: more than ``texture`` by one cloud's noise."""
     visible: int
+    """Map points that fall onto valid cells."""
     used: int
     textured: int
     residual_mm: float
-    """Robust rms of the rows' distances."""
+    """Robust rms of the distances."""
     texture_residual: float
-    centre: Array
-    """(3,) mm: the point in camera axes that rotations are about."""
-    radius_mm: float
+    """The same of the differences in texture, at the cloud's typical brightness."""
 
 
-def visible_surface(live: NDArray[np.float32], stride: int = 4) -> tuple[Array, float]:
-    """Centre (3,) and rms radius (mm) of the points of live (rows, columns, >= 3): the scale of rotations."""
+def visible_surface(live: NDArray[np.float32], stride: int = 4) -> Frame6:
+    """Centre and rms radius of the points of live (rows, columns, LIVE)."""
     points = live[::stride, ::stride, :3].reshape(-1, 3)
     points = points[np.isfinite(points[:, 2])].astype(np.float64)
     centre = points.mean(axis=0)
-    return centre, float(np.sqrt(((points - centre) ** 2).sum(axis=1).mean()))
+    return Frame6(centre, float(np.sqrt(((points - centre) ** 2).sum(axis=1).mean())))
 
 
 class Linearisation:
-    """Builds normal equations at a pose; owns the scratch arrays."""
+    """Builds normal equations at a pose; owns the rows."""
 
     def __init__(self) -> None:
-        self._sums = np.zeros((4, 6, 6))
-        self._gradients = np.zeros((2, 6))
-        self._moments = np.zeros(10)
-        self._statistics = np.zeros(_STATISTICS)
+        self._surface = np.empty((_SURFACE_ROWS, 0), np.float32)
+        self._texture = np.empty((_TEXTURE_ROWS, 0), np.float32)
 
     def at(
         self,
         T_world_camera: Array,
         world: MergedMap,
-        rows: NDArray[np.int32],
+        chosen: NDArray[np.int32],
         live: NDArray[np.float32],
         coefficients: NDArray[np.float32],
-        *,
-        centre: Array,
-        radius_mm: float,
-        gate_mm: float,
-        scale_mm: float,
-        texture_scale: float,
-        texture_sigma: float,
-        normal_sigma: float,
-        photometric: bool,
-        stride: int = 1,
+        frame: Frame6,
+        scales: Scales,
     ) -> NormalEquations:
-        """Of the map's ``rows`` against ``live``.
-
-        Distances beyond ``gate_mm`` are no pairs; ``scale_mm`` and ``texture_scale`` are the robust scales of the
-        two kinds of residuals; ``normal_sigma`` and ``texture_sigma`` are the noise of one cloud's normals and texture.
-        """
-        for sums in (self._sums, self._gradients, self._moments, self._statistics):
-            sums[:] = 0.0
-        _accumulate(
-            world.rows, world.ints, rows, live, coefficients, np.ascontiguousarray(rigid.inverse(T_world_camera)),
-            centre, radius_mm, gate_mm, scale_mm, texture_scale, normal_sigma, photometric, stride,
-            self._sums, self._gradients, self._moments, self._statistics,
+        """Of the map's rows ``chosen`` against ``live`` (rows, columns, LIVE) with its grid's rays (2, 5)."""
+        if self._surface.shape[1] < len(chosen):
+            self._surface = np.empty((_SURFACE_ROWS, len(chosen)), np.float32)
+            self._texture = np.empty((_TEXTURE_ROWS, len(chosen)), np.float32)
+        visible, used, textured, squares, weights, texture_squares, texture_weights = _rows(
+            world.rows, world.ints, chosen, live, coefficients, rigid.inverse(T_world_camera),
+            frame.centre, frame.radius_mm, scales.gate_mm, scales.distance_mm, scales.texture, scales.normal_rad,
+            self._surface, self._texture,
         )  # fmt: skip
-        for block in self._sums:
-            block += np.triu(block.T, 1)
-        s = self._statistics
-        geometry, texture, texture_noise = self._sums[0].copy(), self._sums[1].copy(), TEXTURE_SLOPE_VARIANCE * texture_sigma**2 * self._sums[2]
-        mean_noise = self._moments[0] / max(np.trace(geometry[:3, :3]), 1e-300)
+        surface = _gram(self._surface[:7], used)
+        tilted = _gram(self._surface[7:], used)
+        texture = _gram(self._texture, textured)
+        geometry = surface[:6, :6]
+        tilt_variance = tilted[0, 0] / max(np.trace(geometry[:3, :3]), 1e-300)
         return NormalEquations(
             geometry=geometry,
-            geometry_gradient=self._gradients[0].copy(),
-            texture=texture,
-            texture_gradient=self._gradients[1].copy(),
-            geometry_noise=_isotropic(self._moments) - mean_noise * geometry,
-            texture_noise=texture_noise,
-            visible=int(s[_VISIBLE]),
-            used=int(s[_USED]),
-            textured=int(s[_TEXTURED]),
-            residual_mm=float(np.sqrt(s[_SQUARES] / max(s[_WEIGHTS], 1e-300))),
-            texture_residual=float(np.sqrt(s[_TEXTURE_SQUARES] / max(s[_TEXTURE_WEIGHTS], 1e-300))),
-            centre=centre,
-            radius_mm=radius_mm,
+            geometry_gradient=-surface[:6, 6],
+            geometry_noise=_any_normal(tilted) - tilt_variance * geometry,
+            texture=0.5 * (texture[:6, 6:12] + texture[6:12, :6]),
+            texture_gradient=-texture[:6, 12],
+            texture_map=texture[:6, :6],
+            texture_live=texture[6:12, 6:12],
+            visible=visible,
+            used=used,
+            textured=textured,
+            residual_mm=float(np.sqrt(squares / max(weights, 1e-30))),
+            texture_residual=float(np.sqrt(texture_squares / max(texture_weights, 1e-30))),
         )
 
 
-def _isotropic(moments: Array) -> Array:
-    """(6, 6) information of normals that point anywhere, from the sums of w, w s and w s s^T."""
-    w, s, ss = moments[0], moments[1:4], moments[4:10]
-    S = np.array([[ss[0], ss[3], ss[4]], [ss[3], ss[1], ss[5]], [ss[4], ss[5], ss[2]]])
+def _any_normal(tilted: Array) -> Array:
+    """(6, 6) information of normals that point anywhere, from the sums (4, 4) of w (1, s)(1, s)^T."""
+    S = tilted[1:, 1:]
     M = np.zeros((6, 6))
-    M[:3, :3] = w * np.eye(3)
-    M[3:, :3] = rigid.skew(s)
+    M[:3, :3] = tilted[0, 0] * np.eye(3)
+    M[3:, :3] = rigid.skew(tilted[0, 1:])
     M[:3, 3:] = M[3:, :3].T
     M[3:, 3:] = np.trace(S) * np.eye(3) - S
     return M
 
 
 @kernel
-def _accumulate(  # type: ignore[no-untyped-def]
-    map_rows, map_ints, visible, live, coefficients, T_camera_world, centre, radius, gate, scale, texture_scale,
-    normal_sigma, photometric, stride, sums, gradients, moments, statistics,
+def _gram(rows: NDArray[np.float32], count: int) -> Array:
+    """(n, >= count) float32 -> (n, n) float64: the products of all pairs of rows."""
+    n = rows.shape[0]
+    out = np.empty((n, n))
+    for i in range(n):
+        a = rows[i]
+        for j in range(i + 1):
+            b = rows[j]
+            total = np.float32(0.0)
+            for k in range(count):
+                total += a[k] * b[k]
+            out[i, j] = out[j, i] = total
+    return out
+
+
+@kernel
+def _rows(  # type: ignore[no-untyped-def]
+    map_rows, map_ints, chosen, live, coefficients, T_camera_world, centre, radius, gate, scale, texture_scale,
+    normal_sigma, surface, textured,
 ):  # fmt: skip
+    """Fills surface (11, n) and textured (13, n) with weighted rows; returns counts and robust sums of squares."""
     f = np.float32
     T = T_camera_world
     r00, r01, r02, tx = f(T[0, 0]), f(T[0, 1]), f(T[0, 2]), f(T[0, 3])
     r10, r11, r12, ty = f(T[1, 0]), f(T[1, 1]), f(T[1, 2]), f(T[1, 3])
     r20, r21, r22, tz = f(T[2, 0]), f(T[2, 1]), f(T[2, 2]), f(T[2, 3])
-    c0, c1, c2, c3, c4 = coefficients[0]
-    d0, d1, d2, d3, d4 = coefficients[1]
+    c0, c1, c2, c3, c4 = coefficients[0, 0], coefficients[0, 1], coefficients[0, 2], coefficients[0, 3], coefficients[0, 4]
+    d0, d1, d2, d3, d4 = coefficients[1, 0], coefficients[1, 1], coefficients[1, 2], coefficients[1, 3], coefficients[1, 4]
     gx, gy, gz, per_radius = f(centre[0]), f(centre[1]), f(centre[2]), f(1.0 / radius)
-    one, three, half = f(1.0), f(3.0), f(0.5)
-    inverse_scale2, gate32 = f(1.0 / (4.0 * scale * scale)), f(gate)
-    texture_weight, inverse_texture2 = f(1.0 / texture_scale**2), f(1.0 / (4.0 * texture_scale**2))
-    J = np.zeros(6, np.float32)
-    A = np.zeros(6, np.float32)
-    B = np.zeros(6, np.float32)
+    zero, half, one, three = f(0.0), f(0.5), f(1.0), f(3.0)
+    per_scale2, gate32 = f(0.25 / (scale * scale)), f(gate)
+    per_texture2 = f(1.0 / (texture_scale * texture_scale))
+    tilt_scale = f(normal_sigma)
     rows, columns = live.shape[0], live.shape[1]
-    for i in range(0, visible.size, stride):
-        m = map_rows[visible[i]]
+    visible = used = texture_used = 0
+    squares = weights = texture_squares = texture_weights = 0.0
+    for i in range(chosen.size):
+        m = map_rows[chosen[i]]
         x = r00 * m[0] + r01 * m[1] + r02 * m[2] + tx
         y = r10 * m[0] + r11 * m[1] + r12 * m[2] + ty
         z = r20 * m[0] + r21 * m[1] + r22 * m[2] + tz
-        if not z > f(0.0):
+        if not z > zero:
             continue
-        a, b = x / z, y / z
+        per_z = one / z
+        a, b = x * per_z, y * per_z
         r2 = a * a + b * b
         u = c0 + c1 * a + c2 * b + r2 * (c3 * a + c4 * b)
         v = d0 + d1 * a + d2 * b + r2 * (d3 * a + d4 * b)
+        if not (u > -half and v > -half):
+            continue
         column, row = int(u + half), int(v + half)
-        if not (u > -half and v > -half and column < columns and row < rows):
+        if column >= columns or row >= rows:
             continue
         q = live[row, column]
         if not q[3] == q[3]:
             continue
-        statistics[_VISIBLE] += 1.0
+        visible += 1
         nx = r00 * m[3] + r01 * m[4] + r02 * m[5]
         ny = r10 * m[3] + r11 * m[4] + r12 * m[5]
         nz = r20 * m[3] + r21 * m[4] + r22 * m[5]
@@ -189,67 +219,55 @@ def _accumulate(  # type: ignore[no-untyped-def]
         # the noise of the map's normals would turn into a pull towards whole cells.
         ahead = (q[3] * q[0] + q[4] * q[1] + q[5] * q[2]) / (q[3] * x + q[4] * y + q[5] * z)
         residual = (nx * x + ny * y + nz * z) * (ahead - one)
-        if abs(residual) > gate32:
+        if not abs(residual) <= gate32:
             continue
-        statistics[_USED] += 1.0
-        # Variance along the normal: the live point's, and the map point's that averages `count` of them.
-        count = f(map_ints[visible[i], COUNT])
-        weight = q[9] / (facing * facing) * count / (count + one)
-        robust = one / (one + residual * residual * inverse_scale2)
+        # The variance along the normal is the live point's, times 1 + 1/count for the map point's.
+        count = f(map_ints[chosen[i], COUNT])
+        trust = count / (count + one)
+        robust = one / (one + residual * residual * per_scale2)
         robust *= robust
-        statistics[_SQUARES] += robust * residual * residual
-        statistics[_WEIGHTS] += robust
-        w = weight * robust
+        squares += robust * residual * residual
+        weights += robust
+        w = np.sqrt(robust * trust * q[10]) / facing
         sx, sy, sz = (q[0] - gx) * per_radius, (q[1] - gy) * per_radius, (q[2] - gz) * per_radius
-        J[0], J[1], J[2] = nx, ny, nz
-        J[3], J[4], J[5] = sy * nz - sz * ny, sz * nx - sx * nz, sx * ny - sy * nx
-        for k in range(6):
-            wj = w * J[k]
-            gradients[0, k] -= wj * residual
-            for n in range(k + 1):
-                sums[0, k, n] += wj * J[n]
-        tilt = w * f(normal_sigma * normal_sigma) / count
-        moments[0] += tilt
-        moments[1] += tilt * sx
-        moments[2] += tilt * sy
-        moments[3] += tilt * sz
-        moments[4] += tilt * sx * sx
-        moments[5] += tilt * sy * sy
-        moments[6] += tilt * sz * sz
-        moments[7] += tilt * sx * sy
-        moments[8] += tilt * sx * sz
-        moments[9] += tilt * sy * sz
-        if not (photometric and facing >= f(FACING) and q[7] + q[8] == q[7] + q[8]):
+        surface[0, used], surface[1, used], surface[2, used] = w * nx, w * ny, w * nz
+        surface[3, used] = w * (sy * nz - sz * ny)
+        surface[4, used] = w * (sz * nx - sx * nz)
+        surface[5, used] = w * (sx * ny - sy * nx)
+        surface[6, used] = w * residual
+        tilt = w * tilt_scale / np.sqrt(count)
+        surface[7, used], surface[8, used], surface[9, used], surface[10, used] = tilt, tilt * sx, tilt * sy, tilt * sz
+        used += 1
+        if not (facing >= f(FACING) and q[7] == q[7]):
             continue
-        # The live texture where the map point falls: bilinear, from the offset to this cell's own ray. (The
-        # slopes are too smooth for it: they would pull towards whole cells.)
+        # The live texture where the map point falls: bilinear, from the offset to this cell's own ray.
         fx, fy = c1 + c3 * (three * a * a + b * b), d2 + d4 * (a * a + three * b * b)
         du, dv = fx * (a - q[0] / q[2]), fy * (b - q[1] / q[2])
-        aside, below = column + (1 if du > f(0.0) else -1), row + (1 if dv > f(0.0) else -1)
+        aside, below = column + (1 if du > zero else -1), row + (1 if dv > zero else -1)
         du, dv = abs(du), abs(dv)
         here = (one - du) * q[6] + du * live[row, aside, 6]
         there = (one - du) * live[below, column, 6] + du * live[below, aside, 6]
-        difference = (one - dv) * here + dv * there - m[TEXTURE]
-        if not abs(difference) < f(1.0):
+        difference = (one - dv) * here + dv * there - m[9]
+        squared = difference * difference * q[12]
+        if not squared < one:
             continue
-        # A camera motion moves the map point by minus itself in camera axes.
-        per_z = one / z
-        hx, hy = x - gx, y - gy
-        hz = z - gz
-        hx, hy, hz = hx * per_radius, hy * per_radius, hz * per_radius
-        ux, uz = -fx * per_z, fx * a * per_z
-        vy, vz = -fy * per_z, fy * b * per_z
-        A[0], A[1], A[2], A[3], A[4], A[5] = ux, f(0.0), uz, hy * uz, hz * ux - hx * uz, -hy * ux
-        B[0], B[1], B[2], B[3], B[4], B[5] = f(0.0), vy, vz, hy * vz - hz * vy, -hx * vz, hx * vy
-        robust = one / (one + difference * difference * inverse_texture2)
+        robust = one / (one + f(0.25) * squared * per_texture2)
         robust *= robust
-        statistics[_TEXTURED] += 1.0
-        statistics[_TEXTURE_SQUARES] += robust * difference * difference
-        statistics[_TEXTURE_WEIGHTS] += robust
-        w = texture_weight * robust * count / (count + one)
-        for k in range(6):
-            jk = q[7] * A[k] + q[8] * B[k]
-            gradients[1, k] -= w * jk * difference
-            for n in range(k + 1):
-                sums[1, k, n] += w * jk * (q[7] * A[n] + q[8] * B[n])
-                sums[2, k, n] += w * (A[k] * A[n] + B[k] * B[n])
+        texture_squares += robust * squared
+        texture_weights += robust
+        w = -np.sqrt(robust * trust * q[12] * per_texture2)
+        # A camera motion moves the map point by minus itself in camera axes: J = -(g, s x g).
+        hx, hy, hz = w * m[10], w * m[11], w * m[12]
+        hx, hy, hz = r00 * hx + r01 * hy + r02 * hz, r10 * hx + r11 * hy + r12 * hz, r20 * hx + r21 * hy + r22 * hz
+        textured[0, texture_used], textured[1, texture_used], textured[2, texture_used] = hx, hy, hz
+        textured[3, texture_used] = sy * hz - sz * hy
+        textured[4, texture_used] = sz * hx - sx * hz
+        textured[5, texture_used] = sx * hy - sy * hx
+        hx, hy, hz = w * q[7], w * q[8], w * q[9]
+        textured[6, texture_used], textured[7, texture_used], textured[8, texture_used] = hx, hy, hz
+        textured[9, texture_used] = sy * hz - sz * hy
+        textured[10, texture_used] = sz * hx - sx * hz
+        textured[11, texture_used] = sx * hy - sy * hx
+        textured[12, texture_used] = -w * difference
+        texture_used += 1
+    return visible, used, texture_used, squares, weights, texture_squares, texture_weights
