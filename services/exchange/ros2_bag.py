@@ -9,11 +9,10 @@ from pathlib import Path
 import yaml
 from mcap.writer import CompressionType, Writer
 
-from endo3d.schemas.messages import MapDelta, Message
+from endo3d.schemas.messages import Message
 from endo3d.services.exchange import ros2_types
-from endo3d.services.exchange.ros2_messages import TOPICS, Ros2Message, cloud, to_ros2
+from endo3d.services.exchange.ros2_messages import TOPICS, Ros2Message, Translator
 from endo3d.services.runtime.errors import UserError
-from endo3d.services.views.merged import MergedMap
 
 QOS = """\
 - history: keep_last
@@ -41,16 +40,12 @@ def write_ros2_bag(
     target.mkdir(parents=True)
     with (target / f"{target.name}_0.mcap").open("wb") as file:
         bag = _Bag(Writer(file, compression=CompressionType.NONE), namespace)
-        merged, last = MergedMap(), None
+        translator = Translator()
         for message in messages:
-            if isinstance(message, MapDelta):
-                merged.add(message)
-                last = message
-            for converted in to_ros2(message):
-                bag.put(converted)
-        points = merged.points()
-        if last is not None and points is not None and len(points):
-            bag.put(Ros2Message("map", max(last.stamp_ns, bag.end_ns), cloud(last, points)))
+            for translated in translator.of(message):
+                bag.put(translated)
+        for translated in translator.map_now():
+            bag.put(translated)
         bag.finish()
     (target / "metadata.yaml").write_text(yaml.safe_dump(bag.metadata(target.name), sort_keys=False))
     return bag.counts

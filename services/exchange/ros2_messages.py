@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,6 +13,7 @@ from endo3d.schemas import messages as m
 from endo3d.services.exchange import cdr
 from endo3d.services.exchange.depth import depth_mm
 from endo3d.services.exchange.finite import finite
+from endo3d.services.views.merged import MergedMap
 from endo3d_core import rigid
 from endo3d_core.trajectory import covariance
 
@@ -49,24 +51,58 @@ class Ros2Message(NamedTuple):
         return cdr.encode(self.type, self.content)
 
 
-def to_ros2(message: m.Message) -> Iterator[Ros2Message]:
-    """What ROS 2 can say of a message; nothing of one it has no word for."""
-    match message:
-        case m.Frame():
-            yield Ros2Message("image_raw", message.stamp_ns, image(message, message.image))
-        case m.DepthMap():
-            z_m = depth_mm(message) * np.float32(1e-3)
-            yield Ros2Message("depth", message.stamp_ns, image(message, z_m))
-        case m.Cloud():
-            yield Ros2Message("points", message.stamp_ns, cloud(message, message.points))
-        case m.Pose() if message.state is not m.Tracking.LOST:
-            yield Ros2Message("odometry", message.stamp_ns, odometry(message))
-        case m.Transform():
-            yield Ros2Message("/tf", message.stamp_ns, {"transforms": [transform(message)]})
-        case m.CameraCalibration():
-            yield Ros2Message("camera_info", message.stamp_ns, camera_info(message))
-        case _:
-            pass
+class Translator:
+    """Tells ROS 2 what endo3d's messages say; what it has no word for stays unsaid.
+
+    The calibration goes with every image, at its stamp, as ROS wants it; the merged map goes out whole, every
+    ``map_period_ns`` of message time, or only when asked.
+    """
+
+    def __init__(self, map_period_ns: float | None = None) -> None:
+        self._camera: m.CameraCalibration | None = None
+        self._merged = MergedMap()
+        self._delta: m.MapDelta | None = None
+        self._map_period_ns = map_period_ns
+        self._map_ns: int | None = None
+
+    def of(self, message: m.Message) -> Iterator[Ros2Message]:
+        """One message in, those of ROS out."""
+        match message:
+            case m.CameraCalibration():
+                self._camera = message
+            case m.Frame():
+                yield Ros2Message("image_raw", message.stamp_ns, image(message, message.image))
+                if self._camera is not None:
+                    info = camera_info(replace(self._camera, stamp_ns=message.stamp_ns))
+                    yield Ros2Message("camera_info", message.stamp_ns, info)
+            case m.DepthMap():
+                z_m = depth_mm(message) * np.float32(1e-3)
+                yield Ros2Message("depth", message.stamp_ns, image(message, z_m))
+            case m.Cloud():
+                yield Ros2Message("points", message.stamp_ns, cloud(message, message.points))
+            case m.Pose() if message.state is not m.Tracking.LOST:
+                yield Ros2Message("odometry", message.stamp_ns, odometry(message))
+            case m.Transform():
+                yield Ros2Message("/tf", message.stamp_ns, {"transforms": [transform(message)]})
+            case m.MapDelta():
+                self._merged.add(message)
+                self._delta = replace(message, points=message.points[:0], removed=message.removed[:0])
+                if self._map_due(message.stamp_ns):
+                    yield from self.map_now()
+            case _:
+                pass
+
+    def map_now(self) -> Iterator[Ros2Message]:
+        """The merged map as it stands; nothing before the first points."""
+        points = self._merged.points()
+        if self._delta is not None and points is not None and len(points):
+            self._map_ns = self._delta.stamp_ns
+            yield Ros2Message("map", self._delta.stamp_ns, cloud(self._delta, points))
+
+    def _map_due(self, stamp_ns: int) -> bool:
+        if self._map_period_ns is None:
+            return False
+        return self._map_ns is None or not 0 <= stamp_ns - self._map_ns < self._map_period_ns
 
 
 def header(stamp_ns: int, frame_id: str) -> dict[str, Any]:

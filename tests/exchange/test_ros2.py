@@ -15,7 +15,7 @@ from scans import DIST, START_NS, K, messages, points_of, pose_of
 from endo3d.schemas import messages as m
 from endo3d.services.exchange import ros2_types
 from endo3d.services.exchange.ros2_bag import write_ros2_bag
-from endo3d.services.exchange.ros2_messages import TOPICS, Ros2Message, to_ros2
+from endo3d.services.exchange.ros2_messages import TOPICS, Ros2Message, Translator
 from endo3d.services.runtime.errors import UserError
 
 store = get_typestore(Stores.ROS2_JAZZY)
@@ -40,7 +40,9 @@ def as_rosbags(name: str, values: dict[str, Any]) -> Any:
 
 def converted() -> dict[str, Ros2Message]:
     """One message of each topic."""
-    return {found.topic: found for message in messages(3) for found in to_ros2(message)}
+    translator = Translator()
+    found = [translated for message in messages(3) for translated in translator.of(message)]
+    return {translated.topic: translated for translated in [*found, *translator.map_now()]}
 
 
 @pytest.mark.parametrize("name", ros2_types.DEFINITIONS)
@@ -54,7 +56,7 @@ def test_type_hashes_and_members_are_those_of_ros(name: str) -> None:
     ]
 
 
-@pytest.mark.parametrize("topic", sorted(set(TOPICS) - {"map"}))
+@pytest.mark.parametrize("topic", TOPICS)
 def test_messages_are_serialised_as_rosbags_does(topic: str) -> None:
     message = converted()[topic]
     expected = bytes(store.serialize_cdr(as_rosbags(message.type, message.content), message.type))
@@ -92,7 +94,7 @@ def test_a_lost_pose_is_not_odometry() -> None:
     lost = m.Pose(
         pose.stamp_ns, 0, pose.T_world_camera, pose.information, m.Tracking.LOST, 0, np.eye(6)[0], 0, 0, 0
     )
-    assert list(to_ros2(lost)) == []
+    assert list(Translator().of(lost)) == []
 
 
 def test_rosbags_reads_the_bag(tmp_path: Path) -> None:
@@ -100,15 +102,20 @@ def test_rosbags_reads_the_bag(tmp_path: Path) -> None:
     with AnyReader([tmp_path / "bag"]) as bag:
         seen = {name: info.msgcount for name, info in bag.topics.items()}
         assert seen == dict(counts)
-        assert seen["/endo3d/image_raw"] == seen["/endo3d/odometry"] == seen["/tf"] == 5
+        assert (
+            seen["/endo3d/image_raw"]
+            == seen["/endo3d/camera_info"]
+            == seen["/endo3d/odometry"]
+            == seen["/tf"]
+            == 5
+        )
         assert bag.start_time == START_NS
         last = {}
         for connection, stamp_ns, raw in bag.messages():
             message = bag.deserialize(raw, connection.msgtype)
             last[connection.topic] = message
             header = message.transforms[0].header if connection.topic == "/tf" else message.header
-            if connection.topic != "/endo3d/map":
-                assert header.stamp.sec * 10**9 + header.stamp.nanosec == stamp_ns
+            assert header.stamp.sec * 10**9 + header.stamp.nanosec == stamp_ns
     frames = [message for message in messages(5) if isinstance(message, m.Frame)]
     image = last["/endo3d/image_raw"]
     assert (image.encoding, image.step) == ("mono8", 480)
