@@ -161,12 +161,11 @@ class Bus:
         self._writer(topic, topic.key(self.rig, source)).put(payload)
         self.tally.publish(topic.name)
 
-    def subscribe(
-        self, topic: Topic, handler: Callable[[Message], None], *, depth: int | None = None
-    ) -> None:
-        """Call ``handler`` with every message of ``topic``, in a thread of its own.
+    def subscribe(self, topic: Topic, handler: Callable[[Message], None], *, newest: bool = False) -> None:
+        """Call ``handler`` with the messages of ``topic``, in a thread of its own.
 
-        ``depth``: samples that may wait, by default the topic's. Malformed ones are counted and dropped.
+        ``newest``: a slow handler skips to the newest message. Otherwise ``topic.depth`` of them may wait,
+        and what is missed beyond that is counted. Malformed messages are counted and dropped.
         """
 
         def deliver(sample: Sample) -> None:
@@ -174,10 +173,10 @@ class Bus:
             if message is not None:
                 handler(message)
 
-        self.subscribe_encoded(topic, deliver, depth=depth)
+        self.subscribe_encoded(topic, deliver, newest=newest)
 
     def subscribe_encoded(
-        self, topic: Topic, handler: Callable[[Sample], None], *, depth: int | None = None
+        self, topic: Topic, handler: Callable[[Sample], None], *, newest: bool = False
     ) -> None:
         """The same with samples as they travelled."""
         if topic.bulk and self._view is not None:
@@ -187,7 +186,7 @@ class Bus:
                 )
             )
         reader = Reader(
-            self._session, topic.key(self.rig), topic, handler, self._view, self.tally, depth or topic.depth
+            self._session, topic.key(self.rig), topic, handler, self._view, self.tally, newest=newest
         )
         self._readers.append(reader)
         reader.start()

@@ -8,13 +8,13 @@ import threading
 import time
 import weakref
 from collections.abc import Callable
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import zenoh
 from numpy.typing import NDArray
-from zenoh.ext import AdvancedSubscriber, HistoryConfig, declare_advanced_subscriber
-from zenoh.handlers import Handler, RingChannel
+from zenoh.ext import HistoryConfig, declare_advanced_subscriber
+from zenoh.handlers import RingChannel
 
 from endo3d.schemas.topics import Topic
 from endo3d.services.runtime.service import Sample
@@ -40,16 +40,19 @@ class Reader(threading.Thread):
         deliver: Callable[[Sample], None],
         view: View | None,
         tally: Tally,
-        depth: int,
+        *,
+        newest: bool,
     ) -> None:
+        """``newest``: the ring holds one sample, and what it drops is skipped on purpose, not lost."""
         super().__init__(name=f"read {topic.name}", daemon=True)
         self._topic = topic
         self._deliver = deliver
         self._view = view
         self._tally = tally
+        self._newest = newest
         self._expected: dict[str, int] = {}
         self._chunks: weakref.WeakSet[Chunk] = weakref.WeakSet()
-        self._subscriber = _subscribe(session, key, topic, depth)
+        self._subscriber = _subscribe(session, key, topic, 1 if newest else topic.depth)
 
     def run(self) -> None:
         with contextlib.suppress(zenoh.ZError):  # the ring is closed
@@ -75,7 +78,7 @@ class Reader(threading.Thread):
         topic = self._topic.name
         self._tally.receive(topic)
         missed = self._missed(sample)
-        if missed:
+        if missed and not self._newest:
             self._tally.drop(topic, "missed", missed)
         chunk, content = self._content(sample.payload)
         source = str(sample.key_expr).rsplit("/", 1)[-1] if self._topic.per_service else ""
@@ -103,9 +106,8 @@ class Reader(threading.Thread):
         return missed if missed < _SEQUENCES // 2 else 0
 
 
-def _subscribe(
-    session: zenoh.Session, key: str, topic: Topic, depth: int
-) -> zenoh.Subscriber[Handler[zenoh.Sample]] | AdvancedSubscriber[Handler[zenoh.Sample]]:
+def _subscribe(session: zenoh.Session, key: str, topic: Topic, depth: int) -> Any:
+    """zenoh's subscriber, the advanced one for a latched topic."""
     ring: RingChannel[zenoh.Sample] = RingChannel(depth)
     if not topic.latched:
         return session.declare_subscriber(key, ring)

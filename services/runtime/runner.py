@@ -66,6 +66,8 @@ class Runner:
         self._failures_in_a_row = 0
         self._failures_named: set[str] = set()
         self._last_failure = ""
+        self._is_open = False
+        self._answer: tuple[dict[str, int], str, dict[str, float]] = ({}, "", {})
         self._lost_before = 0
 
     def stop(self) -> None:
@@ -81,6 +83,7 @@ class Runner:
         self._service.loan = self._bus.loan
         try:
             self._service.open()
+            self._is_open = True
             self._service.warm()
             self._connect()
             self._state = ServiceState.READY
@@ -90,9 +93,9 @@ class Runner:
             raise
         finally:
             self._bus.stop_reading()
-            self._service.close()
-            if self._state is not ServiceState.FAILED:
-                self._state = ServiceState.STOPPED
+            self._ask()
+            self._is_open = False
+            self._close()
             self._closed.set()
             status.join()
             logging.getLogger().removeHandler(handler)
@@ -101,13 +104,23 @@ class Runner:
     def _connect(self) -> None:
         service, bus = self._service, self._bus
         for topic in service.reads:
+            newest = topic in service.newest
             if isinstance(service, Tap):
-                bus.subscribe_encoded(topic, self._take)
+                bus.subscribe_encoded(topic, self._take, newest=newest)
             else:
-                bus.subscribe(topic, self._step)
+                bus.subscribe(topic, self._step, newest=newest)
         bus.serve(self._command)
         bus.declare_alive()
         log.info("ready")
+
+    def _close(self) -> None:
+        try:
+            self._service.close()
+        except Exception as error:
+            log.exception("closing failed")
+            self._state, self._last_failure = ServiceState.FAILED, f"close: {error!r}"
+        if self._state is not ServiceState.FAILED:
+            self._state = ServiceState.STOPPED
 
     def _work(self) -> None:
         service = self._service
@@ -184,10 +197,11 @@ class Runner:
 
     def _status(self) -> Status:
         received, published, dropped = self._bus.tally.snapshot()
-        for cause, count in self._service.losses().items():
+        losses, trouble, values = self._ask()
+        for cause, count in losses.items():
             dropped[cause] = dropped.get(cause, 0) + count
         lost = sum(dropped.values())
-        notes = [self._bus.note, self._service.trouble()]
+        notes = [self._bus.note, trouble]
         if lost > self._lost_before:
             notes.append(f"lost {lost - self._lost_before} in the last second")
         self._lost_before = lost
@@ -211,8 +225,21 @@ class Runner:
             received=received,
             published=published,
             dropped=dropped,
-            values=dict(self._service.values()),
+            values=values,
         )
+
+    def _ask(self) -> tuple[dict[str, int], str, dict[str, float]]:
+        """The service's own losses, trouble and values; while it is not open, its last answer.
+
+        Asked between its steps or beside them: a service that hangs still has a status.
+        """
+        if self._is_open:
+            try:
+                service = self._service
+                self._answer = dict(service.losses()), service.trouble(), dict(service.values())
+            except Exception as error:
+                self._fail("status", error)
+        return self._answer
 
     def _shown_state(self, rate_hz: float, note: str) -> ServiceState:
         if self._state is not ServiceState.READY:
