@@ -35,6 +35,7 @@ class Code(IntEnum):
     BAD_COMMAND = 3
     NOT_ALLOWED_IN_MODE = 5
     BAD_PARAMETER = 6
+    NOT_PRESENT = 7
     COMPRESSION = 9
     BIT_NUMBER = 10
     IMAGE_MISSING = 11
@@ -54,6 +55,10 @@ class Nack(Exception):
         self.code = code
 
 
+DMDS = {1: ("DLP6500", 1920, 1080, 1), 2: ("DLP9000", 2560, 1600, 2)}
+"""Name, width, height, controllers."""
+Where = tuple[int, int]
+"""Controller (0 primary, 1 secondary) and image index."""
 ON_THE_FLY = 3
 STOPPED, PAUSED, RUNNING = 0, 1, 2
 
@@ -71,6 +76,10 @@ class LutEntry:
     trigger_2: bool
     image: int
     position: int
+
+    @property
+    def where(self) -> tuple[int, int, int]:
+        return self.image, self.position, self.depth
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -100,8 +109,8 @@ class Show:
 class Dlpc900:
     """The controller's state; ``receive`` takes one report, ``send`` gives the next one of the reply."""
 
-    width: int = 1920
-    height: int = 1080
+    dmd: int = 1
+    """Its type as command 0206 tells it: 1 = DLP6500, 2 = DLP9000 (a second controller has the right half)."""
     on_show: Callable[[Show], None] = lambda show: None
     on_dark: Callable[[], None] = lambda: None
 
@@ -113,21 +122,35 @@ class Dlpc900:
     lut: tuple[LutEntry, ...] = ()
     order: tuple[int, ...] = ()
     shown_count: int = 0
-    images: dict[int, bytearray] = field(default_factory=dict)
-    announced: dict[int, int] = field(default_factory=dict)
-    receiving_image: int = -1
+    images: dict[Where, bytearray] = field(default_factory=dict)
+    announced: dict[Where, int] = field(default_factory=dict)
+    receiving_image: Where | None = None
     trigger_out: dict[int, tuple[bool, int, int]] = field(
         default_factory=lambda: {1: (False, 0, 0), 2: (False, 0, 0)}
     )
     trigger_in: dict[int, tuple[int, int]] = field(default_factory=lambda: {1: (105, 0), 2: (0, 0)})
     idle_mirrors: bool = False
     pwm_polarity: int = 0
+    faults: int = 0
+    """Fault bits of the hardware status, set by tests."""
     uploads: int = 0
     """Images received since power-up: a mode switch must not raise it."""
 
     _incoming: bytearray = field(default_factory=bytearray)
     _missing: int = 0
     _replies: deque[bytes] = field(default_factory=deque)
+
+    @property
+    def width(self) -> int:
+        return DMDS[self.dmd][1]
+
+    @property
+    def height(self) -> int:
+        return DMDS[self.dmd][2]
+
+    @property
+    def controllers(self) -> int:
+        return DMDS[self.dmd][3]
 
     def receive(self, report: bytes) -> None:
         """One 64-byte OUT report: the head of a message or its continuation."""
@@ -184,9 +207,9 @@ class Dlpc900:
             case 0x0205:
                 return struct.pack("<4I", 0x06000000, 0x06000000, 0x06000000, 0x06000000)
             case 0x0206:
-                return b"\x01" + b"endo3d emulated DLP6500".ljust(31, b"\0")
+                return bytes([self.dmd]) + f"endo3d emulated {DMDS[self.dmd][0]}".encode().ljust(31, b"\0")
             case 0x1A0A:
-                return b"\x01"
+                return bytes([0x01 | (self.controllers == 2) << 4 | self.faults])
             case 0x1A0B:
                 return b"\x01"
             case 0x1A0C:
@@ -214,12 +237,10 @@ class Dlpc900:
                 self._configure(*struct.unpack_from("<HI", data))
             case 0x1A32:
                 self._reorder(data)
-            case 0x1A2A:
-                self._announce_image(*struct.unpack_from("<HI", data))
-            case 0x1A2B:
-                self._receive_image(data)
-            case 0x1A2C | 0x1A2D:
-                raise Nack(Code.NOT_ALLOWED_IN_MODE)  # no secondary controller on a DLP6500
+            case 0x1A2A | 0x1A2C:
+                self._announce_image((command - 0x1A2A) // 2, *struct.unpack_from("<HI", data))
+            case 0x1A2B | 0x1A2D:
+                self._receive_image((command - 0x1A2B) // 2, data)
             case 0x1A1D | 0x1A1E:
                 self._set_trigger_out(command - 0x1A1C, *struct.unpack_from("<Bhh", data))
             case 0x1A35:
@@ -236,7 +257,7 @@ class Dlpc900:
         if mode > 2:
             raise Nack(Code.BAD_PARAMETER)
         if mode == 2:
-            self.__init__(self.width, self.height, self.on_show, self.on_dark)  # type: ignore[misc]
+            self.__init__(self.dmd, self.on_show, self.on_dark)  # type: ignore[misc]
         self.power = mode % 2
         self.on_dark()
 
@@ -254,7 +275,7 @@ class Dlpc900:
             raise Nack(Code.BAD_PARAMETER)
         if mode != self.display_mode:
             self.definitions, self.lut, self.order = {}, (), ()
-            self.images, self.announced, self.receiving_image = {}, {}, -1
+            self.images, self.announced, self.receiving_image = {}, {}, None
         self.display_mode = mode
 
     def _define(self, data: bytes) -> None:
@@ -300,7 +321,9 @@ class Dlpc900:
             raise Nack(Code.PATTERN_NUMBER)
         if any(index not in self.definitions for index in range(entries)):
             raise Nack(Code.BAD_DEFINITION)
-        self.lut = tuple(self.definitions[index] for index in range(entries))
+        before, self.lut = self.lut, tuple(self.definitions[index] for index in range(entries))
+        if [entry.where for entry in self.lut] != [entry.where for entry in before]:
+            self.images, self.announced = {}, {}  # a change of count, depth or index needs a new upload
         self.order = tuple(range(entries))
         self.shown_count = shown
 
@@ -314,28 +337,30 @@ class Dlpc900:
             raise Nack(Code.PATTERN_NUMBER)
         self.order, self.shown_count = order, shown
 
-    def _announce_image(self, index: int, size: int) -> None:
+    def _announce_image(self, controller: int, index: int, size: int) -> None:
         self._needs_on_the_fly()
         self._needs_standstill()
+        if controller >= self.controllers:
+            raise Nack(Code.NOT_PRESENT)
         if index >= IMAGES:
             raise Nack(Code.MEMORY_ADDRESS)
-        self.images[index] = bytearray()
-        self.announced[index] = size
-        self.receiving_image = index
+        self.receiving_image = where = controller, index
+        self.images[where], self.announced[where] = bytearray(), size
 
-    def _receive_image(self, data: bytes) -> None:
-        if self.receiving_image < 0:
+    def _receive_image(self, controller: int, data: bytes) -> None:
+        where = self.receiving_image
+        if where is None or where[0] != controller:
             raise Nack(Code.IMAGE_MISSING)
         (count,) = struct.unpack_from("<H", data)
         if count > 504 or len(data) < 2 + count:
             raise Nack(Code.BAD_PARAMETER)
-        image = self.images[self.receiving_image]
+        image = self.images[where]
         image += data[2 : 2 + count]
-        if len(image) > self.announced[self.receiving_image]:
+        if len(image) > self.announced[where]:
             raise Nack(Code.MEMORY_ADDRESS)
-        if len(image) == self.announced[self.receiving_image]:
+        if len(image) == self.announced[where]:
             self.uploads += 1
-            self.receiving_image = -1
+            self.receiving_image = None
 
     def _set_trigger_out(self, output: int, inverted: int, rise_us: int, fall_us: int) -> None:
         if not (-20 <= rise_us <= 20_000 and -20 <= fall_us <= 20_000):
@@ -372,10 +397,13 @@ class Dlpc900:
         return Show(tuple(patterns), self.shown_count, self.trigger_out[1])
 
     def _image_words(self, index: int) -> NDArray[np.uint32]:
-        blob = self.images.get(index, b"")
-        if not blob or len(blob) != self.announced[index]:
+        return np.hstack([self._half_words((controller, index)) for controller in range(self.controllers)])
+
+    def _half_words(self, where: Where) -> NDArray[np.uint32]:
+        blob = self.images.get(where, b"")
+        if not blob or len(blob) != self.announced[where]:
             raise Nack(Code.IMAGE_MISSING)
         words = decode_words(bytes(blob))
-        if words.shape != (self.height, self.width):
+        if words.shape != (self.height, self.width // self.controllers):
             raise Nack(Code.IMAGE_MISSING)
         return words

@@ -79,7 +79,7 @@ def _words(body: bytes) -> NDArray[np.uint32]:
     if len(body) % 3:
         raise BadImage(f"{len(body)} bytes are no whole number of 24-bit pixels", BMP_COMPRESSION)
     red_first = np.frombuffer(body, np.uint8).reshape(-1, 3).astype(np.uint32)
-    return red_first[:, 0] << 16 | red_first[:, 1] << 8 | red_first[:, 2]
+    return (red_first[:, 0] << 16 | red_first[:, 1] << 8 | red_first[:, 2]).astype(np.uint32, copy=False)
 
 
 class _Stream:
@@ -116,8 +116,9 @@ def _expand_rle(body: bytes, width: int, pixels: int, *, enhanced: bool) -> NDAr
         if kind == "previous line":
             if filled < width:
                 raise BadImage("the first line has no previous line to copy", BMP_COMPRESSION)
-            for index in range(filled, filled + count):  # a copy may run on over its own output
-                out[index] = out[index - width]
+            for start in range(filled, filled + count, width):  # a copy may run on over its own output
+                stop = min(start + width, filled + count)
+                out[start:stop] = out[start - width : stop - width]
         else:
             out[filled : filled + count] = values
         filled += count

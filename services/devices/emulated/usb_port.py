@@ -49,7 +49,7 @@ class UsbPort(usb.backend.IBackend):  # type: ignore[misc]
     def plug_in(self) -> None:
         """The device comes back as after power-up: it has forgotten everything."""
         old = self.device
-        self.device = Dlpc900(old.width, old.height, old.on_show, old.on_dark)
+        self.device = Dlpc900(old.dmd, old.on_show, old.on_dark)
         self.plugged = True
         self.kernel_driver = True
 
