@@ -45,9 +45,7 @@ def scan_blueprint(stand: Stand = BEFORE_ANY_MAP) -> rrb.Blueprint:
                             eye_up=stand.up,
                         ),
                     ),
-                    rrb.Spatial3DView(
-                        origin="/" + entries.CAMERA, name="cloud", background=NIGHT, line_grid=False
-                    ),
+                    rrb.Spatial3DView(origin="/" + entries.CAMERA, name="cloud", background=NIGHT, line_grid=False),
                 ),
                 rrb.Horizontal(
                     rrb.TimeSeriesView(

@@ -28,9 +28,8 @@ TABLES = {name: table(name) for name in RAMPS}
 
 def coloured(values: NDArray[np.floating], low: float, high: float, ramp: str) -> NDArray[np.uint8]:
     """(..., 3) uint8 RGB of values, ``low``..``high`` (may be the smaller) over the ramp; NaN is grey."""
-    span = high - low or 1.0
     valid = np.isfinite(values)
-    at = np.where(valid, (values - low) * (255.0 / span), 0.0)
+    at = np.where(valid, (values - low) * (255.0 / (high - low)), 0.0)
     rgb = TABLES[ramp][np.clip(at, 0, 255).astype(np.uint8)]
     rgb[~valid] = MISSING
     return rgb
@@ -44,9 +43,9 @@ def packed(rgb: NDArray[np.uint8]) -> NDArray[np.uint32]:
 
 
 def spread(values: NDArray[np.floating], share: float = 0.02) -> tuple[float, float]:
-    """The range of the values without the outermost ``share`` at both ends; (0, 1) when there are none."""
+    """The range of the values without the outermost ``share`` at both ends, never empty; (0, 1) of none."""
     finite = values[np.isfinite(values)]
     if not len(finite):
         return 0.0, 1.0
     low, high = np.quantile(finite, [share, 1 - share])
-    return float(low), float(high)
+    return (float(low), float(high)) if high > low else (float(low) - 0.5, float(low) + 0.5)

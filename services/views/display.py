@@ -107,11 +107,7 @@ class Display:
     def _due(self, kind: str, stamp_ns: int) -> bool:
         """Whether a period has passed since the last of this kind, or time went back (a loop, a seek)."""
         last = self._shown_ns.get(kind)
-        due = (
-            last is None
-            or stamp_ns < last
-            or stamp_ns - last >= 0.98 * self._period_ns.get(kind, self._most_ns)
-        )
+        due = last is None or stamp_ns < last or stamp_ns - last >= 0.98 * self._period_ns.get(kind, self._most_ns)
         if due:
             self._shown_ns[kind] = stamp_ns
         return due

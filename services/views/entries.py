@@ -49,9 +49,7 @@ def world() -> Iterator[Entry]:
         ("sigma_weak_um", (216, 102, 63)),
         ("inlier_share", (63, 191, 134)),
     ):
-        yield Entry(
-            f"{PLOTS}/pose/{name}", rr.SeriesLines(colors=colour, names=name, widths=1.5), static=True
-        )
+        yield Entry(f"{PLOTS}/pose/{name}", rr.SeriesLines(colors=colour, names=name, widths=1.5), static=True)
 
 
 def frame(message: m.Frame) -> Iterator[Entry]:
@@ -60,9 +58,7 @@ def frame(message: m.Frame) -> Iterator[Entry]:
     while image.shape[1] > 1000:
         image = cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)  # type: ignore[assignment]
     encoded = cv2.imencode(".jpg", image, (cv2.IMWRITE_JPEG_QUALITY, 85))[1].tobytes()
-    yield Entry(
-        IMAGE, rr.EncodedImage(contents=encoded, media_type="image/jpeg"), len(encoded), width=image.shape[1]
-    )
+    yield Entry(IMAGE, rr.EncodedImage(contents=encoded, media_type="image/jpeg"), len(encoded), width=image.shape[1])
 
 
 def grey(image: NDArray[Any]) -> NDArray[np.uint8]:
@@ -107,9 +103,7 @@ def cloud(message: m.Cloud, colour: str) -> Iterator[Entry]:
         yield points_entry(CLOUD, xyz(points), rgb, CLOUD_RADIUS_MM)
 
 
-def points_entry(
-    path: str, positions: NDArray[np.float32], rgb: NDArray[np.uint8], radius_mm: float
-) -> Entry:
+def points_entry(path: str, positions: NDArray[np.float32], rgb: NDArray[np.uint8], radius_mm: float) -> Entry:
     """Points with colours packed into words, which Rerun takes as they are."""
     return Entry(path, rr.Points3D(positions, colors=packed(rgb), radii=radius_mm), 16 * len(positions))
 
@@ -154,9 +148,7 @@ def status(message: m.Status) -> Iterator[Entry]:
 
 def mode(message: m.Mode) -> Iterator[Entry]:
     """A line in the log: what the projector shows from now on."""
-    text = f"{message.mode}: {message.pattern_set}, epoch {message.epoch}" + (
-        "" if message.running else ", stopped"
-    )
+    text = f"{message.mode}: {message.pattern_set}, epoch {message.epoch}" + ("" if message.running else ", stopped")
     yield Entry(f"{LOG}/mode", rr.TextLog(text, level="INFO"))
 
 

@@ -42,7 +42,7 @@ def picture(
         fig = Figure(figsize=(SIZE_PX[0] / 150, SIZE_PX[1] / 150))
         scene = fig.add_axes((0, 0, SCENE_PX[0] / SIZE_PX[0], 1))
         scene.set_axis_off()
-        if len(points):
+        if len(points) > 2:
             shown = colouring(points, colour, scan.viewer(), deviation_um)
             scene.imshow(three_d(scan, xyz(points), shown.rgb()), interpolation="none")
             _ramp(fig, shown)
@@ -155,9 +155,7 @@ def _words(fig: Figure, scan: Scan, count: int, title: str) -> None:
         scene = scan.truths[-1].scene.split()[0]
         text = f"simulated frames: virtual rig, scene {scene}"
         fig.text(0.025, 0.880, text, fontsize=10, va="top", style="italic", color=figures.COLOURS[1])
-    fig.text(
-        0.045, 0.028, "orange: way of the tip, camera frustum at the last pose", fontsize=8, color="#b9bec7"
-    )
+    fig.text(0.045, 0.028, "orange: way of the tip, camera frustum at the last pose", fontsize=8, color="#b9bec7")
 
 
 def _image(axes: Axes, scan: Scan) -> None:
@@ -167,9 +165,7 @@ def _image(axes: Axes, scan: Scan) -> None:
     axes.grid(False)
     if scan.frame is None:
         return
-    axes.set_title(
-        f"camera, frame {scan.frame.sequence}: pattern {scan.frame.slot} of {scan.frame.pattern_set}"[:78]
-    )
+    axes.set_title(f"camera, frame {scan.frame.sequence}: pattern {scan.frame.slot} of {scan.frame.pattern_set}"[:78])
     axes.imshow(scan.frame.image, cmap="gray", vmin=0, vmax=float(scan.frame.image.max()) or 1)
 
 
@@ -180,9 +176,7 @@ def _depth(axes: Axes, scan: Scan) -> None:
     axes.grid(False)
     if scan.depth is None:
         return
-    z_mm = np.where(
-        scan.depth.depth > 0, scan.depth.offset_mm + scan.depth.scale_mm * scan.depth.depth, np.nan
-    )
+    z_mm = np.where(scan.depth.depth > 0, scan.depth.offset_mm + scan.depth.scale_mm * scan.depth.depth, np.nan)
     low, high = spread(z_mm)
     shown = axes.imshow(z_mm, cmap=figures.RAMPS["height"].reversed(), vmin=low, vmax=high)
     beside = axes.inset_axes((1.015, 0.0, 0.02, 1.0))

@@ -117,9 +117,7 @@ class Scan:
         if len(positions) < 2:
             return 0.0
         width = min(10, len(positions))
-        smooth = np.stack(
-            [np.convolve(axis, np.full(width, 1 / width), "valid") for axis in positions.T], axis=1
-        )
+        smooth = np.stack([np.convolve(axis, np.full(width, 1 / width), "valid") for axis in positions.T], axis=1)
         return float(np.linalg.norm(np.diff(smooth, axis=0), axis=1).sum())
 
     def points(self) -> NDArray[Any]:

@@ -121,9 +121,7 @@ def shade(depth: NDArray[np.float32], eye: Eye, scale_mm: float) -> NDArray[np.f
     return np.where(seen, light, 0).astype(np.float32)
 
 
-def _masked_blur(
-    values: NDArray[np.float32], mask: NDArray[np.bool_], sigma_px: float
-) -> NDArray[np.float32]:
+def _masked_blur(values: NDArray[np.float32], mask: NDArray[np.bool_], sigma_px: float) -> NDArray[np.float32]:
     """Gaussian mean over the pixels of the mask only; a wide one is taken on a smaller picture."""
     height, width = values.shape
     shrink = max(1, int(sigma_px / 2))

@@ -29,9 +29,7 @@ def executable() -> Path:
 
 def has_display() -> bool:
     """Whether a window could open."""
-    return sys.platform in ("win32", "darwin") or bool(
-        os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
-    )
+    return sys.platform in ("win32", "darwin") or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
 def free_port(wanted: int) -> int:
@@ -41,9 +39,7 @@ def free_port(wanted: int) -> int:
         try:
             probe.bind((HOST, wanted))
         except OSError as error:
-            raise UserError(
-                f"port {wanted} is busy; give the viewer another one (0 takes any free port)"
-            ) from error
+            raise UserError(f"port {wanted} is busy; give the viewer another one (0 takes any free port)") from error
         return int(probe.getsockname()[1])
 
 
@@ -65,9 +61,7 @@ class ViewerProcess:
     @property
     def page(self) -> str:
         """Where a browser looks; empty for a window."""
-        return (
-            "" if self.web_port is None else f"http://{HOST}:{self.web_port}/?url={quote(self.url, safe='')}"
-        )
+        return "" if self.web_port is None else f"http://{HOST}:{self.web_port}/?url={quote(self.url, safe='')}"
 
     @property
     def pid(self) -> int:
