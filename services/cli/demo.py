@@ -53,6 +53,7 @@ def demo(
         print(json.dumps(report, indent=2))
     else:
         show(report)
+    raise typer.Exit(report["exit_code"])
 
 
 def _recording(folder: Path) -> list[str]:

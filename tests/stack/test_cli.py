@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 from endo3d.services.cli.app import LazyGroup, app
 from endo3d.services.runtime import stack_file
 from endo3d.services.runtime.errors import UserError
-from endo3d.services.runtime.session import meeting_port
+from endo3d.services.runtime.session import meeting_ports
 
 LIMIT_S = 60
 COMMANDS = list(LazyGroup().commands)
@@ -132,7 +132,7 @@ class TestBadInput:
     def test_busy_ports(self, taken_ports: str) -> None:
         """All meeting ports of a rig belong to foreign programs."""
         line = complaint("run", "sequencer", "--set", f"rig.name={taken_ports}")
-        assert str(meeting_port(taken_ports)) in line
+        assert str(meeting_ports(taken_ports)[0]) in line
 
     def test_busy_port_of_the_viewer(self, tmp_path: Path) -> None:
         with socket.create_server(("127.0.0.1", 0)) as server:
@@ -168,8 +168,7 @@ def _required(command: str, folder: Path) -> list[str]:
 def taken_ports() -> Iterator[str]:
     """The name of a rig whose meeting ports are taken by somebody who doesn't speak zenoh."""
     rig = f"taken{os.getpid()}"
-    first = meeting_port(rig)
-    servers = [socket.create_server(("127.0.0.1", first + index)) for index in range(3)]
+    servers = [socket.create_server(("127.0.0.1", port)) for port in meeting_ports(rig)]
     yield rig
     for server in servers:
         server.close()
