@@ -1,0 +1,229 @@
+"""Section 4.2, second part: the contour standard scanned by hand for 26 s (table 5, fig. 11)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from endo3d.services.evaluation import figures_of_merit as merit
+from endo3d.services.evaluation.cache import Cache, Result
+from endo3d.services.evaluation.calibrated import calibrated
+from endo3d.services.evaluation.measure import Map, Points, Progress, clouds, merged
+from endo3d.services.evaluation.report import Report, Table
+from endo3d.services.evaluation.virtual_run import VirtualRun, head_yaml
+from endo3d.services.views.figures import COLOURS, RAMPS, figure
+from endo3d_core import metrology
+from endo3d_core.virtual_rig import contour_standard as standard
+from endo3d_core.virtual_rig.effects import FULL
+from endo3d_core.virtual_rig.scene import parse
+from endo3d_core.virtual_rig.truth import distance
+
+HEAD = "base6_wd20"
+SCENE = "contour surface=metal texture=noise:0.15:0.15"
+MOTION = "hand seed=7 reach=5 speed=3"
+PATTERNS = "interleaved f1=15"
+RATE_HZ = 172.0
+DURATION_S = 26.0
+SHARE_DURATION_S = 8.0
+"""Once along the standard and back."""
+QUICK_S = 0.5
+MERGING_UM = 75.0
+BIN_PX = 2
+"""Of the camera: 960x600 pixels."""
+AT_LEAST = 10
+"""Observations of a map point that counts."""
+BASE_Z_MM = 20.0
+VARIANTS: dict[str, tuple[str, ...]] = {
+    "all effects": (),
+    "without fibres": ("projector_fibre", "camera_fibre"),
+    "without noise": ("noise", "quantisation"),
+    "without motion blur": ("motion_blur",),
+    "with exact calibration": (),
+    "with true poses": (),
+}
+PAPER: dict[str, tuple[float, float, float, str]] = {
+    "radius, small": (1e3 * standard.RADIUS_SMALL_MM, 476.3, 10.9, "um"),
+    "radius, large": (1e3 * standard.RADIUS_LARGE_MM, 1027.0, 12.8, "um"),
+    "angle": (standard.ANGLE_DEG, 87.4, 7.2, "deg"),
+    "step, large": (1e3 * standard.STEP_LARGE_MM, 995.3, 7.2, "um"),
+    "step, small": (1e3 * standard.STEP_SMALL_MM, 480.0, 8.0, "um"),
+}
+"""Table 5: reference, measured, form deviation / um."""
+
+
+def steps(quick: bool) -> int:
+    """Frames in all."""
+    if quick:
+        return round(QUICK_S * RATE_HZ)
+    return round(RATE_HZ * (DURATION_S + len(VARIANTS) * SHARE_DURATION_S))
+
+
+def evaluate(folder: Path, quick: bool, threads: int, progress: Progress) -> Report:
+    """Measure, or take what was measured before; tables, plots and figures."""
+    name = "handheld-quick" if quick else "handheld"
+    cache = Cache(folder / f"{name}.cache.json")
+    duration_s = QUICK_S if quick else DURATION_S
+    scan = folder / f"{name}.map.npz"
+    done = 0
+
+    def measured(variant: str, seconds: float, keep: Path | None) -> Callable[[], Result]:
+        return lambda: _measure(variant, seconds, threads, lambda n: progress(done + n), keep)
+
+    result = cache.get("scan", measured("all effects", duration_s, scan))
+    done += round(duration_s * RATE_HZ)
+    progress(done)
+    shares: dict[str, Result] = {}
+    for variant in () if quick else VARIANTS:
+        shares[variant] = cache.get(variant, measured(variant, SHARE_DURATION_S, None))
+        done += round(SHARE_DURATION_S * RATE_HZ)
+        progress(done)
+    return _report(folder, name, duration_s, result or {}, shares, scan)
+
+
+def _measure(variant: str, seconds: float, threads: int, progress: Progress, keep: Path | None) -> Result:
+    true = head_yaml(HEAD)
+    effects = FULL.without(*VARIANTS[variant])
+    run = VirtualRun(true, SCENE, MOTION, PATTERNS, RATE_HZ, round(seconds * RATE_HZ), effects=effects, bin_px=BIN_PX)
+    known = None if variant == "with exact calibration" else calibrated(true)
+    found = merged(
+        clouds(run, known, threads, progress),
+        MERGING_UM,
+        at_least=AT_LEAST,
+        true_poses=variant == "with true poses",
+    )
+    if keep is not None:
+        np.savez(keep, points=found.points.astype(np.float32), path=found.estimated[:, :3, 3])
+    return {"features": features(found.points), "odometry": _odometry(found)}
+
+
+def _odometry(found: Map) -> dict[str, Any]:
+    """Trajectory and surface against the truth."""
+    off_um = 1e3 * (found.estimated[:, :3, 3] - found.true[:, :3, 3])
+    surface = metrology.surface_error(found.points, lambda p: distance(parse(SCENE, BASE_Z_MM), p))
+    return {
+        "ate_um": float(np.sqrt(np.mean(np.sum(off_um**2, axis=1)))),
+        "end_um": [float(v) for v in off_um[-1]],
+        "states": found.states,
+        "surface_std_um": surface.std_um,
+        "surface_p95_um": surface.p95_um,
+        "map_points": surface.count,
+    }
+
+
+def features(points: Points) -> dict[str, Result]:
+    """The five features of table 5 from points in the scene's axes: value and form, None where not seen."""
+    x = points[:, 0]
+
+    def between(a: float, b: float) -> Points:
+        return points[(x > a) & (x < b)]
+
+    found: dict[str, Result] = {}
+    for name, at, radius in (
+        ("radius, small", standard.SMALL_CYLINDER_X_MM, standard.RADIUS_SMALL_MM),
+        ("radius, large", standard.LARGE_CYLINDER_X_MM, standard.RADIUS_LARGE_MM),
+    ):
+        fit = merit.cylinder(points, at, radius)
+        found[name] = fit and {"value": 1e3 * radius + fit["size_um"], "form_um": fit["form_um"]}
+    wedge, step = standard.WEDGE_X_MM, standard.LARGE_STEP_X_MM
+    left, right = between(wedge - 0.85, wedge - 0.2), between(wedge + 0.2, wedge + 1.3)
+    found["angle"] = None
+    if min(len(left), len(right)) > merit.LEAST_POINTS:
+        flanks = metrology.fit_plane(left), metrology.fit_plane(right)
+        inside = np.array((wedge, float(np.median(points[:, 1])), BASE_Z_MM))
+        distances = np.concatenate((flanks[0].distance(left), flanks[1].distance(right)))
+        angle = metrology.wedge_angle_deg(*flanks, inside)
+        found["angle"] = {"value": angle, "form_um": merit.form_um(distances)}
+    top = between(step + 0.4, standard.SMALL_STEP_X_MM - 0.4)
+    for name, lower in (
+        ("step, large", between(step - 1.0, step - 0.4)),
+        ("step, small", between(standard.SMALL_STEP_X_MM + 0.4, standard.SMALL_STEP_X_MM + 2.0)),
+    ):
+        found[name] = None
+        if min(len(lower), len(top)) > merit.LEAST_POINTS:
+            base = metrology.fit_plane(lower)
+            height, _ = metrology.step_height_mm(base, top)
+            above = base.distance(top)
+            form = merit.form_um(np.concatenate((base.distance(lower), above - np.median(above))))
+            found[name] = {"value": 1e3 * height, "form_um": form}
+    return found
+
+
+def _report(
+    folder: Path, name: str, seconds: float, result: dict[str, Any], shares: dict[str, Result], scan: Path
+) -> Report:
+    rows = []
+    for feature, (reference, paper, paper_form, unit) in PAPER.items():
+        digits = 2 if unit == "deg" else 1
+        ours = result["features"][feature]
+        theirs = (f"{paper:.{digits}f} ({paper - reference:+.{digits}f})", f"{paper_form:.1f}")
+        mine = ("not seen", "")
+        if ours is not None:
+            mine = (
+                f"{ours['value']:.{digits}f} ({ours['value'] - reference:+.{digits}f})",
+                f"{ours['form_um']:.1f}",
+            )
+        goal = f"{abs(paper - reference) / 3:.{digits}f}"
+        rows.append((f"{feature} / {unit}", f"{reference:.{digits}f}", *theirs, *mine, goal))
+    columns = ("feature", "reference", "paper", "form / um", "ours", "form / um", "goal: error below")
+    tables = [Table(f"Table 5, {seconds:g} s by hand", columns, rows)]
+    o = result["odometry"]
+    states = ", ".join(f"{state} {count}" for state, count in o["states"].items())
+    tables.append(
+        Table(
+            "Against the known truth (the paper had none)",
+            ("figure", "ours"),
+            [
+                ("trajectory error, rms / um", f"{o['ate_um']:.1f}"),
+                ("at the end, x y z / um", ", ".join(f"{v:.1f}" for v in o["end_um"])),
+                ("surface error, std / um", f"{o['surface_std_um']:.1f}"),
+                ("surface error, 95 % below / um", f"{o['surface_p95_um']:.1f}"),
+                ("clouds", states),
+                ("map points", f"{o['map_points']}"),
+            ],
+        )
+    )
+    if shares:
+        tables.append(_share_table(shares))
+    _plot(folder / f"{name}.png", scan)
+    return Report(
+        name,
+        "Scan by hand (paper: table 5 and fig. 11)",
+        [
+            f"`{SCENE}` scanned along its profile, motion `{MOTION}` (seeded: drift of about 3 mm/s, tremor of "
+            f"50 to 100 um at 8 to 12 Hz), {RATE_HZ:g} Hz, `{PATTERNS}`, head {HEAD}, camera binned to 960x600, "
+            f"merging distance {MERGING_UM:g} um, map points with {AT_LEAST} observations or more. "
+            f"The shares are of the first {SHARE_DURATION_S:g} s: once along the standard and back.",
+        ],
+        tables,
+        [f"{name}.png"],
+        {"scan": result, "shares": shares},
+    )
+
+
+def _share_table(shares: dict[str, Result]) -> Table:
+    """Deviation of every feature with single effects switched off."""
+    rows = []
+    for variant, result in shares.items():
+        cells = []
+        for feature, (reference, _, _, unit) in PAPER.items():
+            ours = (result or {"features": {}})["features"].get(feature)
+            cells.append("not seen" if ours is None else f"{ours['value'] - reference:+.{2 if unit == 'deg' else 1}f}")
+        rows.append((variant, *cells, f"{result['odometry']['ate_um']:.1f}" if result else ""))
+    columns = ("deviation", *(f"{feature} / {PAPER[feature][3]}" for feature in PAPER), "trajectory / um")
+    return Table(f"Shares of the error, {SHARE_DURATION_S:g} s", columns, rows)
+
+
+def _plot(path: Path, scan: Path) -> None:
+    """Fig. 11: the merged points above, the path of the head below."""
+    kept = np.load(scan)
+    points, track = kept["points"], kept["path"]
+    with figure("Merged scan and path of the head", simulated=True, path=path, size_in=(8.5, 5)) as fig:
+        above, below = fig.subplots(2, 1, height_ratios=(2, 1), sharex=True)
+        some = points[np.random.default_rng(0).permutation(len(points))[:60_000]]
+        above.scatter(some[:, 0], BASE_Z_MM - some[:, 2] + 0.3 * some[:, 1], s=0.3, c=some[:, 2], cmap=RAMPS["height"])
+        above.set(ylabel="height + 0.3 y / mm", title="map", aspect="equal")
+        below.plot(track[:, 0], track[:, 1], color=COLOURS[0], lw=0.7)
+        below.set(xlabel="x / mm", ylabel="y / mm", title="path of the sensor head")
