@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from endo3d.schemas import messages as m
 from endo3d.services.views import entries
@@ -26,8 +28,16 @@ RERUN_FIELD_DEG = 68.0
 class Display:
     """What is on show: images, clouds, depth maps, poses at ``rate_hz``, map and way at ``map_hz``."""
 
-    def __init__(self, rate_hz: float = 30.0, map_hz: float = 2.0, colour: str = "height") -> None:
+    def __init__(
+        self,
+        rate_hz: float = 30.0,
+        map_hz: float = 2.0,
+        colour: str = "height",
+        deviation_um: Callable[[NDArray[Any]], NDArray[np.floating]] | None = None,
+    ) -> None:
+        """deviation_um: map points -> distances from the truth (n,), for colour ``deviation``."""
         self.colour = colour
+        self.deviation_um = deviation_um
         self.viewer = np.zeros(3)
         self.way: list[tuple[float, float, float]] = []
         self.merged = MergedMap()
@@ -73,7 +83,8 @@ class Display:
         if points is None or not len(points):
             return
         points = points[:: -(-len(points) // MOST_SHOWN)]
-        rgb = colouring(points, self.colour, self.viewer).rgb()
+        deviation_um = self.deviation_um(points) if self.deviation_um is not None else None
+        rgb = colouring(points, self.colour, self.viewer, deviation_um).rgb()
         radius_mm = 0.6 * self.merged.merging_distance_mm or entries.CLOUD_RADIUS_MM
         yield entries.points_entry(entries.MAP, xyz(points), rgb, radius_mm)
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from endo3d.schemas import messages as m
 from endo3d.services.views.colour import packed, spread
-from endo3d.services.views.colouring import colouring
+from endo3d.services.views.colouring import by_height, by_quality
 from endo3d.services.views.scan import xyz
 
 WORLD, CAMERA = "world", "world/camera"
@@ -96,11 +96,11 @@ def rigid(T: NDArray[np.float64]) -> rr.Transform3D:
 
 
 def cloud(message: m.Cloud, colour: str) -> Iterator[Entry]:
-    """The points of one measurement that are valid, in the camera frame."""
+    """The points of one measurement that are valid, in the camera frame: by quality, or else by height."""
     points = message.points[np.isfinite(message.points["z"])]
     if len(points):
-        rgb = colouring(points, colour, np.zeros(3)).rgb()
-        yield points_entry(CLOUD, xyz(points), rgb, CLOUD_RADIUS_MM)
+        shown = by_quality(points) if colour == "quality" else by_height(points, np.zeros(3))
+        yield points_entry(CLOUD, xyz(points), shown.rgb(), CLOUD_RADIUS_MM)
 
 
 def points_entry(path: str, positions: NDArray[np.float32], rgb: NDArray[np.uint8], radius_mm: float) -> Entry:

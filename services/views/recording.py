@@ -13,11 +13,11 @@ from endo3d.services.views.sink import FileSink, Sink
 RATE_HZ, MAP_HZ = 15.0, 1.0
 
 
-def write_rrd(messages: Iterable[Message], path: str | Path, *, colour: str = "height") -> None:
+def write_rrd(messages: Iterable[Message], path: str | Path, display: Display | None = None) -> None:
     """Writes messages in their order, thinned to 15 Hz, the map once a second and at the end."""
     sink = FileSink(Path(path), scan_blueprint())
     try:
-        play(messages, sink, Display(RATE_HZ, MAP_HZ, colour))
+        play(messages, sink, display or Display(RATE_HZ, MAP_HZ))
     finally:
         sink.close()
 
