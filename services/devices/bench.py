@@ -67,9 +67,7 @@ class Bench:
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o600)
         try:
             if os.fstat(descriptor).st_size < HEADER_BYTES + IMAGES * IMAGE_BYTES:
-                os.ftruncate(
-                    descriptor, HEADER_BYTES + IMAGES * IMAGE_BYTES
-                )  # sparse: only what is used exists
+                os.ftruncate(descriptor, HEADER_BYTES + IMAGES * IMAGE_BYTES)  # sparse: only what is used exists
             self._map = mmap.mmap(descriptor, 0)
         finally:
             os.close(descriptor)
@@ -87,17 +85,13 @@ class Bench:
         for i, image in enumerate(images):
             start = HEADER_BYTES + i * IMAGE_BYTES
             self._bytes[start : start + height * width].reshape(height, width)[:] = image
-        held = replace(
-            before, width=width, height=height, placed=len(images), generation=before.generation + 1
-        )
+        held = replace(before, width=width, height=height, placed=len(images), generation=before.generation + 1)
         self.show(dark(held))
 
     def image(self, place: int, shown: Shown) -> NDArray[np.uint8]:
         """(height, width) copy of one image."""
         start = HEADER_BYTES + place * IMAGE_BYTES
-        return (
-            self._bytes[start : start + shown.height * shown.width].reshape(shown.height, shown.width).copy()
-        )
+        return self._bytes[start : start + shown.height * shown.width].reshape(shown.height, shown.width).copy()
 
     def show(self, shown: Shown) -> None:
         """Change what is shown, at once and as a whole."""

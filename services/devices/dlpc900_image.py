@@ -49,8 +49,7 @@ def places(depths: Sequence[int]) -> list[Place]:
         bit += depth
     if found and found[-1].image >= IMAGES:
         raise ValueError(
-            f"{len(depths)} patterns need {found[-1].image + 1} images of 24 bits; "
-            f"the projector holds {IMAGES}"
+            f"{len(depths)} patterns need {found[-1].image + 1} images of 24 bits; the projector holds {IMAGES}"
         )
     return found
 

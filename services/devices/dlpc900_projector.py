@@ -44,9 +44,7 @@ Find = Callable[[], Any]
 
 def open_uri(uri: Uri, setting: Setting) -> Dlpc900Projector:
     offset = (int(uri.number("x", 0)), int(uri.number("y", 0)))
-    trigger = TriggerOut(
-        int(uri.number("rise_us", 0)), int(uri.number("fall_us", 0)), bool(uri.number("invert", 0))
-    )
+    trigger = TriggerOut(int(uri.number("rise_us", 0)), int(uri.number("fall_us", 0)), bool(uri.number("invert", 0)))
     lens = Rig.from_yaml(setting.head_yaml).projector
     if uri.body == "emulated":
         from endo3d.services.devices.emulated.light import plugged_in
@@ -108,9 +106,7 @@ class Dlpc900Projector:
             if not self._uploaded:
                 self._upload(controller)
             if pattern_set.text not in self._first:
-                raise DeviceError(
-                    f"pattern set {pattern_set.text!r} is not loaded; name it in the sequencer's modes"
-                )
+                raise DeviceError(f"pattern set {pattern_set.text!r} is not loaded; name it in the sequencer's modes")
             self._check(controller, pattern_set, exposure_us, dark_us)
             try:
                 return self._show(controller, pattern_set, exposure_us, dark_us)
@@ -201,9 +197,7 @@ class Dlpc900Projector:
         pixels[top : top + height, left : left + width] = window
         return pixels
 
-    def _check(
-        self, controller: Controller, pattern_set: PatternSet, exposure_us: float, dark_us: float
-    ) -> None:
+    def _check(self, controller: Controller, pattern_set: PatternSet, exposure_us: float, dark_us: float) -> None:
         """Against what this very device says of itself. Raises ``DeviceError``."""
         if not MINIMUM_DARK_US <= dark_us <= LONGEST_US:
             raise DeviceError(f"dark {dark_us:g} us is too short; the projector needs {MINIMUM_DARK_US} us")
@@ -217,9 +211,7 @@ class Dlpc900Projector:
                     f"for {entry.place.depth}-bit patterns, and takes {LONGEST_US} us at most"
                 )
 
-    def _show(
-        self, controller: Controller, pattern_set: PatternSet, exposure_us: float, dark_us: float
-    ) -> int:
+    def _show(self, controller: Controller, pattern_set: PatternSet, exposure_us: float, dark_us: float) -> int:
         """Times that changed go into the look-up table, the set's entries into the order; no upload."""
         controller.stop()
         first, changed = self._first[pattern_set.text], False

@@ -18,10 +18,10 @@ from numpy.typing import DTypeLike, NDArray
 
 from endo3d.services.devices.bench import Bench, Shown, default_path
 from endo3d.services.devices.camera import Shot
-from endo3d.services.devices.slots import Timeline
 from endo3d.services.devices.uri import DeviceError, Setting, Uri
 from endo3d_core.calibration import Rig
 from endo3d_core.head import Head
+from endo3d_core.slot_identity import Timeline
 from endo3d_core.virtual_rig import motion as motions
 from endo3d_core.virtual_rig import scene as scenes
 from endo3d_core.virtual_rig.effects import PRESETS
@@ -54,9 +54,7 @@ def open_uri(uri: Uri, setting: Setting) -> SimCamera:
 class SimCamera:
     """Triggered by the bench's light; as on a real one, a trigger while it is busy makes no frame."""
 
-    def __init__(
-        self, bench: Bench, renderer: Renderer, motion: Motion, slow_motion: float, seed: int
-    ) -> None:
+    def __init__(self, bench: Bench, renderer: Renderer, motion: Motion, slow_motion: float, seed: int) -> None:
         self._bench, self._renderer, self._motion = bench, renderer, motion
         self.scene, self.slow_motion = renderer.scene.text, slow_motion
         self._seed = seed
@@ -165,15 +163,11 @@ class SimCamera:
             self._lent.append(self._exposing.image)
             self._exposing = None
         if shown.generation != self._generation:
-            self._lights = [
-                self._renderer.light(self._bench.image(place, shown)) for place in range(shown.placed)
-            ]
+            self._lights = [self._renderer.light(self._bench.image(place, shown)) for place in range(shown.placed)]
             self._generation = shown.generation
         if shown.running:
             periods_ns = np.rint((np.array(shown.exposures_us) + shown.dark_us) * 1e3).astype(np.int64)
-            self._timeline = Timeline(
-                shown.start_ns, np.concatenate(([0], np.cumsum(periods_ns))), shown.exposures_us
-            )
+            self._timeline = Timeline(shown.start_ns, np.concatenate(([0], np.cumsum(periods_ns))), shown.exposures_us)
 
 
 def _sleep_until(stamp_ns: int) -> None:

@@ -55,9 +55,7 @@ class SimProjector:
     def start(self, pattern_set: PatternSet, exposure_us: float, dark_us: float) -> int:
         places = self._places.get(pattern_set.text)
         if places is None:
-            raise DeviceError(
-                f"pattern set {pattern_set.text!r} is not loaded; name it in the sequencer's modes"
-            )
+            raise DeviceError(f"pattern set {pattern_set.text!r} is not loaded; name it in the sequencer's modes")
         exposures = tuple(p.exposure_us or exposure_us for p in pattern_set.patterns)
         if min(exposures) < self.limits.min_exposure_us or dark_us < self.limits.min_dark_us:
             raise DeviceError(

@@ -63,9 +63,7 @@ class Uri:
         for key in self.options:
             if key not in self.asked:
                 near = difflib.get_close_matches(key, self.asked, 1)
-                hint = (
-                    f"did you mean {near[0]!r}?" if near else f"it knows: {', '.join(self.asked) or 'none'}"
-                )
+                hint = f"did you mean {near[0]!r}?" if near else f"it knows: {', '.join(self.asked) or 'none'}"
                 raise DeviceError(f"device {self.text!r} has no option {key!r}; {hint}")
 
 

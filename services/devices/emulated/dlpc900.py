@@ -123,11 +123,11 @@ class Dlpc900:
     order: tuple[int, ...] = ()
     shown_count: int = 0
     images: dict[Where, bytearray] = field(default_factory=dict)
+    words: dict[Where, NDArray[np.uint32]] = field(default_factory=dict)
+    """What the images hold, decompressed as they came."""
     announced: dict[Where, int] = field(default_factory=dict)
     receiving_image: Where | None = None
-    trigger_out: dict[int, tuple[bool, int, int]] = field(
-        default_factory=lambda: {1: (False, 0, 0), 2: (False, 0, 0)}
-    )
+    trigger_out: dict[int, tuple[bool, int, int]] = field(default_factory=lambda: {1: (False, 0, 0), 2: (False, 0, 0)})
     trigger_in: dict[int, tuple[int, int]] = field(default_factory=lambda: {1: (105, 0), 2: (0, 0)})
     idle_mirrors: bool = False
     pwm_polarity: int = 0
@@ -275,7 +275,7 @@ class Dlpc900:
             raise Nack(Code.BAD_PARAMETER)
         if mode != self.display_mode:
             self.definitions, self.lut, self.order = {}, (), ()
-            self.images, self.announced, self.receiving_image = {}, {}, None
+            self.images, self.announced, self.words, self.receiving_image = {}, {}, {}, None
         self.display_mode = mode
 
     def _define(self, data: bytes) -> None:
@@ -323,7 +323,7 @@ class Dlpc900:
             raise Nack(Code.BAD_DEFINITION)
         before, self.lut = self.lut, tuple(self.definitions[index] for index in range(entries))
         if [entry.where for entry in self.lut] != [entry.where for entry in before]:
-            self.images, self.announced = {}, {}  # a change of count, depth or index needs a new upload
+            self.images, self.announced, self.words = {}, {}, {}  # a change of count, depth or index needs a new upload
         self.order = tuple(range(entries))
         self.shown_count = shown
 
@@ -346,6 +346,7 @@ class Dlpc900:
             raise Nack(Code.MEMORY_ADDRESS)
         self.receiving_image = where = controller, index
         self.images[where], self.announced[where] = bytearray(), size
+        self.words.pop(where, None)
 
     def _receive_image(self, controller: int, data: bytes) -> None:
         where = self.receiving_image
@@ -361,6 +362,7 @@ class Dlpc900:
         if len(image) == self.announced[where]:
             self.uploads += 1
             self.receiving_image = None
+            self.words[where] = decode_words(bytes(image))
 
     def _set_trigger_out(self, output: int, inverted: int, rise_us: int, fall_us: int) -> None:
         if not (-20 <= rise_us <= 20_000 and -20 <= fall_us <= 20_000):
@@ -390,9 +392,7 @@ class Dlpc900:
                 words[entry.image] = self._image_words(entry.image)
             pixels = bit_plane(words[entry.image], entry.position, entry.depth)
             patterns.append(
-                ShownPattern(
-                    pixels, entry.depth, entry.exposure_us, entry.dark_us, entry.trigger_2, entry.led
-                )
+                ShownPattern(pixels, entry.depth, entry.exposure_us, entry.dark_us, entry.trigger_2, entry.led)
             )
         return Show(tuple(patterns), self.shown_count, self.trigger_out[1])
 
@@ -400,10 +400,7 @@ class Dlpc900:
         return np.hstack([self._half_words((controller, index)) for controller in range(self.controllers)])
 
     def _half_words(self, where: Where) -> NDArray[np.uint32]:
-        blob = self.images.get(where, b"")
-        if not blob or len(blob) != self.announced[where]:
-            raise Nack(Code.IMAGE_MISSING)
-        words = decode_words(bytes(blob))
-        if words.shape != (self.height, self.width // self.controllers):
+        words = self.words.get(where)
+        if words is None or words.shape != (self.height, self.width // self.controllers):
             raise Nack(Code.IMAGE_MISSING)
         return words

@@ -21,9 +21,7 @@ LATENCY_NS = 1_000_000
 """From the start command to the first pattern."""
 
 
-def plugged_in(
-    uri: Uri, setting: Setting, window: tuple[int, int], offset: tuple[int, int]
-) -> Callable[[], Any]:
+def plugged_in(uri: Uri, setting: Setting, window: tuple[int, int], offset: tuple[int, int]) -> Callable[[], Any]:
     """How to find an emulated controller on an emulated USB port. Raises ``DeviceError``."""
     path = Path(uri.text_of("bench", str(default_path(setting.rig))))
     name = f"DLP{uri.text_of('dmd', '6500')}"

@@ -83,9 +83,7 @@ class UsbPort(usb.backend.IBackend):  # type: ignore[misc]
             bInterfaceClass=3, bInterfaceSubClass=0, bInterfaceProtocol=0, iInterface=0, extra_descriptors=[],
         )  # fmt: skip
 
-    def get_endpoint_descriptor(
-        self, dev: object, ep: int, intf: int, alt: int, config: int
-    ) -> SimpleNamespace:
+    def get_endpoint_descriptor(self, dev: object, ep: int, intf: int, alt: int, config: int) -> SimpleNamespace:
         return SimpleNamespace(
             bLength=7, bDescriptorType=5, bEndpointAddress=(ENDPOINT_OUT, ENDPOINT_IN)[ep], bmAttributes=3,
             wMaxPacketSize=REPORT_BYTES, bInterval=1, bRefresh=0, bSynchAddress=0, extra_descriptors=[],
