@@ -61,9 +61,7 @@ def _sums(
 class Bundle:
     """A bundle whose input and output faces both lie on a pixel grid."""
 
-    def __init__(
-        self, width: int, height: int, circle_px: float, pitch_px: float, spot_px: float, seed: int
-    ) -> None:
+    def __init__(self, width: int, height: int, circle_px: float, pitch_px: float, spot_px: float, seed: int) -> None:
         """``spot_px``: sigma of a core's image on the output grid."""
         rng = np.random.default_rng(seed)
         self.width, self.height, self.pitch_px = width, height, pitch_px

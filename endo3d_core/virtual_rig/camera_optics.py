@@ -41,9 +41,7 @@ class CameraOptics:
         self._defocus = defocus.parameters(lens, head, circle_px)
         self._vignette = self._relative_illumination()
         self._bundle = (
-            bundle.bundle(
-                self.width, self.height, circle_px, head.camera_pitch_px / bin_px, SPOT_PX / bin_px, SEED
-            )
+            bundle.bundle(self.width, self.height, circle_px, head.camera_pitch_px / bin_px, SPOT_PX / bin_px, SEED)
             if effects.camera_fibre
             else None
         )

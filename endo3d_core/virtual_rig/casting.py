@@ -116,9 +116,7 @@ class ProfileSight:
     def shadow(self, chunk: Chunk) -> None:
         view, c = self.projector, chunk
         first, per_unit = np.float32(view.first_slope), np.float32(view.slopes_per_unit)
-        profile.shadow(
-            self.T, self.lamp_x, self.lamp_z, first, per_unit, view.advance, BIAS_MM, c.rx, c.ry, c.z, c.lit
-        )
+        profile.shadow(self.T, self.lamp_x, self.lamp_z, first, per_unit, view.advance, BIAS_MM, c.rx, c.ry, c.z, c.lit)
 
 
 class SphereSight:

@@ -62,9 +62,7 @@ def _tile(texture: Texture) -> NDArray[np.float32]:
     spectrum = np.exp(-2.0 * (np.pi * texture.size_mm) ** 2 * k2) + 0.2 * np.exp(
         -0.5 * (np.pi * texture.size_mm) ** 2 * k2
     )
-    noise = np.fft.irfft2(
-        np.fft.rfft2(rng.standard_normal((TILE_PX, TILE_PX))) * spectrum, (TILE_PX, TILE_PX)
-    )
+    noise = np.fft.irfft2(np.fft.rfft2(rng.standard_normal((TILE_PX, TILE_PX))) * spectrum, (TILE_PX, TILE_PX))
     noise /= noise.std()
     return np.clip(1.0 + texture.contrast * noise, 0.05, 1.95).astype(np.float32)
 

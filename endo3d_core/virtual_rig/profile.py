@@ -154,9 +154,7 @@ def slope_range(primitive: NDArray[np.float64], ox: float, oz: float) -> tuple[f
 
 
 @exact
-def hit(
-    primitive: NDArray[np.float64], ox: float, oz: float, dx: float, dz: float
-) -> tuple[float, float, float]:
+def hit(primitive: NDArray[np.float64], ox: float, oz: float, dx: float, dz: float) -> tuple[float, float, float]:
     """Where the ray (ox, oz) + s (dx, dz) first meets a primitive: s (or infinity), the facing normal."""
     if primitive[0] == LINE:
         ax, az = primitive[1] - ox, primitive[2] - oz

@@ -64,14 +64,10 @@ class Radiance:
         self._scratch = np.empty((threads, 9, CHUNK), np.float32)
         self._bodies = np.empty((threads, CHUNK), np.uint8)
 
-    def of(
-        self, light: Light, T_scene_camera: Pose, radiance: NDArray[np.float32], depth: NDArray[np.float32]
-    ) -> None:
+    def of(self, light: Light, T_scene_camera: Pose, radiance: NDArray[np.float32], depth: NDArray[np.float32]) -> None:
         """Fill (n,) radiance, 1 = white and fully lit, and (n,) depth in mm."""
         poses = [np.linalg.inv(body.T_scene_body) @ T_scene_camera for body in self._scene.bodies]
-        sights = [
-            sight(body.shape, T, self._field) for body, T in zip(self._scene.bodies, poses, strict=True)
-        ]
+        sights = [sight(body.shape, T, self._field) for body, T in zip(self._scene.bodies, poses, strict=True)]
         threads = len(self._scratch)
 
         def share(thread: int) -> None:

@@ -74,15 +74,9 @@ def _body(text: str, working_distance_mm: float) -> Body:
     T = transform(at, turn)
     if words.kind == "plane":
         tilt = words.values.get("tilt", "0")
-        angles = (
-            words.vector("tilt", (0.0, 0.0)) if "," in tilt else np.array((words.number("tilt", 0.0), 0.0))
-        )
+        angles = words.vector("tilt", (0.0, 0.0)) if "," in tilt else np.array((words.number("tilt", 0.0), 0.0))
         a, b = np.radians(angles)
-        T = (
-            T
-            @ transform(np.zeros(3), np.array((0.0, a, 0.0)))
-            @ transform(np.zeros(3), np.array((b, 0.0, 0.0)))
-        )
+        T = T @ transform(np.zeros(3), np.array((0.0, a, 0.0))) @ transform(np.zeros(3), np.array((b, 0.0, 0.0)))
     material = _material(words)
     words.finish()
     return Body(words.kind, shape, material, T)

@@ -52,11 +52,7 @@ class Words:
         for key in self.values:
             if key not in self.asked:
                 near = difflib.get_close_matches(key, self.asked, 1)
-                hint = (
-                    f"did you mean {near[0]!r}?"
-                    if near
-                    else f"it knows: {', '.join(sorted(set(self.asked)))}"
-                )
+                hint = f"did you mean {near[0]!r}?" if near else f"it knows: {', '.join(sorted(set(self.asked)))}"
                 raise ValueError(f"{self.what} {self.kind!r} has no {key!r}; {hint}")
 
     def _numbers(self, key: str, count: int | None, separator: str = ",") -> list[float]:
@@ -66,8 +62,6 @@ class Words:
         except ValueError:
             numbers = []
         if not numbers or not np.all(np.isfinite(numbers)) or (count is not None and len(numbers) != count):
-            wanted = (
-                "a list of numbers" if count is None else "a number" if count == 1 else f"{count} numbers"
-            )
+            wanted = "a list of numbers" if count is None else "a number" if count == 1 else f"{count} numbers"
             raise ValueError(f"{self.what} {self.kind!r}: {key}={text} is not {wanted}")
         return numbers

@@ -44,6 +44,13 @@ class VirtualRun:
     begin_s: float = 0.0
     """Where on the motion's path the first pattern is shown."""
 
+    def check(self) -> None:
+        """Raises ``ValueError`` that says what is wrong with a description."""
+        head = Head.from_yaml(self.head_yaml)
+        scenes.parse(self.scene, head.working_distance_mm)
+        motions.parse(self.motion)
+        patterns.parse(self.pattern_set)
+
     @property
     def exposure_us(self) -> float:
         return 1e6 / self.rate_hz - DARK_US

@@ -1,0 +1,109 @@
+"""A virtual run as a log. Interrupted, it goes on from the frames that are whole in the unfinished file."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Callable, Iterator
+from dataclasses import asdict
+from pathlib import Path
+
+from endo3d.schemas import codec, topics
+from endo3d.schemas.messages import Frame, Message, ProjectorCalibration, Truth
+from endo3d.services.archive.entry import CALIBRATION_FILE, Attachment, Entry
+from endo3d.services.archive.facts import host_facts
+from endo3d.services.archive.reader import Log, Unreadable
+from endo3d.services.archive.recording import Recording
+from endo3d.services.archive.recover import recover
+from endo3d.services.archive.writer import Kind
+from endo3d.services.evaluation.virtual_run import VirtualRun
+from endo3d.services.runtime.errors import UserError
+
+DESCRIPTION = "endo3d.run"
+"""The fact of the log that tells which run it holds."""
+FLUSH_FRAMES = 50
+
+
+def prerender(run: VirtualRun, path: Path, threads: int, progress: Callable[[int], None]) -> None:
+    """Render what is missing of ``run`` into the log ``path``.
+
+    Raises ``UserError`` when ``path`` exists and is complete, or holds another run.
+    """
+    unfinished, kept = path.with_suffix(".unfinished.mcap"), path.with_suffix(".kept.mcap")
+    if path.exists():
+        raise UserError(f"{path} exists; remove it, or choose another name")
+    if unfinished.exists():
+        _keep(unfinished, kept, run)
+    recording = Recording(unfinished, {**host_facts(), DESCRIPTION: _name(run)})
+    done = 0
+    try:
+        for message in (*run.calibration(), run.mode()):
+            recording.put(_entry(message))
+        if kept.exists():
+            for frame, truth in _frames_of(kept):
+                _put(recording, frame, truth)
+                done += 1
+            kept.unlink()
+        progress(done)
+        for frame, truth in run.shots(done, threads):
+            _put(recording, frame, truth)
+            done += 1
+            progress(done)
+            if done % FLUSH_FRAMES == 0:
+                recording.flush()
+    finally:
+        recording.finish()
+    os.replace(unfinished, path)
+
+
+def _put(recording: Recording, frame: Frame, truth: Truth) -> None:
+    recording.put(_entry(truth))
+    recording.put(_entry(frame))
+
+
+def _keep(unfinished: Path, kept: Path, run: VirtualRun) -> None:
+    """Move what an interrupted rendering left to ``kept``, if it is of the same run."""
+    try:
+        recover(unfinished)
+        facts = Log(unfinished).facts["endo3d"]
+    except Unreadable:
+        unfinished.unlink()  # it ended before its first whole chunk
+        return
+    if facts.get(DESCRIPTION) != _name(run):
+        raise UserError(f"{unfinished} is of another rendering; remove it, or choose another name")
+    if kept.exists() and Log(kept).count(topics.FRAME) > Log(unfinished).count(topics.FRAME):
+        unfinished.unlink()  # interrupted while it took over what was kept
+    else:
+        os.replace(unfinished, kept)
+
+
+def _frames_of(log: Path) -> Iterator[tuple[Frame, Truth]]:
+    """Whole pairs, from the first frame on, without a gap."""
+    truths = {m.sequence: m for m in Log(log).messages(topics.TRUTH) if isinstance(m, Truth)}
+    for expected, message in enumerate(Log(log).messages(topics.FRAME)):
+        assert isinstance(message, Frame)
+        if message.sequence != expected or expected not in truths:
+            return
+        yield message, truths[expected]
+
+
+def _entry(message: Message) -> Entry:
+    topic = topics.of(message)
+    attachment = None
+    if isinstance(message, ProjectorCalibration):
+        attachment = Attachment(CALIBRATION_FILE, "application/yaml", message.yaml.encode())
+    return Entry(
+        channel=topic.channel(),
+        kind=Kind(*codec.schema(topic)),
+        sequence=getattr(message, "sequence", 0),
+        log_ns=message.stamp_ns,
+        publish_ns=message.stamp_ns,
+        payload=(codec.encode(message),),
+        latched=topic.latched,
+        attachment=attachment,
+    )
+
+
+def _name(run: VirtualRun) -> str:
+    """Tells runs apart: a hash of everything that decides the frames."""
+    return hashlib.sha256(repr(sorted(asdict(run).items())).encode()).hexdigest()
