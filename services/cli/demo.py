@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
     from endo3d.services.cli.up import Asked
     from endo3d.services.cli.watch import Watch
+    from endo3d.services.runtime.bus import Bus
     from endo3d.services.runtime.launcher import Launcher
     from endo3d.services.runtime.stack_file import Stack
 
@@ -28,9 +29,7 @@ START_LIMIT_S = 180.0
 
 def demo(
     seconds: Annotated[float, typer.Option("--seconds", min=1.0, help="How long to scan.")] = 30.0,
-    out: Annotated[
-        Path | None, typer.Option("--out", help="Folder for the files; default out/demo-<time>.")
-    ] = None,
+    out: Annotated[Path | None, typer.Option("--out", help="Folder for the files; default out/demo-<time>.")] = None,
     stack: Annotated[str, typer.Option("--stack", help="Another stack than the stock one.")] = "demo",
     overrides: SetOption = None,
     as_json: JsonOption = False,
@@ -60,8 +59,17 @@ def _recording(folder: Path) -> list[str]:
     return [f"recorder.directory={folder.resolve()}", "recorder.name=scan", "recorder.autostart=true"]
 
 
-def scan(stack: str, overrides: list[str], seconds: float, quiet: bool) -> dict[str, Any]:
-    """Run the stack for ``seconds`` from its first cloud on; what was measured while it ran."""
+def scan(
+    stack: str,
+    overrides: list[str],
+    seconds: float,
+    quiet: bool,
+    when_ready: Callable[[Bus], object] = lambda bus: None,
+) -> dict[str, Any]:
+    """Run the stack for ``seconds`` from its first cloud on; what was measured while it ran.
+
+    ``when_ready`` is called once, when every service has said it is ready.
+    """
     from endo3d.services.cli.up import Asked
     from endo3d.services.cli.watch import Watch, percentiles_ms
     from endo3d.services.runtime import graph, stack_file
@@ -81,7 +89,9 @@ def scan(stack: str, overrides: list[str], seconds: float, quiet: bool) -> dict[
         with Launcher(children_of(described, overrides), lines) as launcher, _progress(quiet) as progress:
             lines.progress = progress
             launcher.start()
-            _await_first_cloud(launcher, watch, asked, described, progress, began_s)
+            _await_ready(launcher, watch, asked, described, progress, began_s)
+            when_ready(bus)
+            _await_first_cloud(launcher, watch, asked, progress, began_s)
             scanned_s = _scan(launcher, watch, asked, described, progress, seconds)
             progress.update(progress.add_task("closing the archive", total=None))
             launcher.stop(hurry=lambda: asked.times > 1)
@@ -94,10 +104,10 @@ def scan(stack: str, overrides: list[str], seconds: float, quiet: bool) -> dict[
             "scan_s": scanned_s,
             "latency_cloud_ms": percentiles_ms(watch.cloud_latency_ms),
             "latency_pose_ms": percentiles_ms(watch.pose_latency_ms),
+            "clouds": watch.clouds,
             "lost": watch.lost(),
-            "restarts": {
-                child.name: child.total_restarts for child in launcher.children if child.total_restarts
-            },
+            "services": watch.loads(),
+            "restarts": {child.name: child.total_restarts for child in launcher.children if child.total_restarts},
             "exit_code": launcher.exit_code,
         }
 
@@ -125,29 +135,36 @@ def _progress(quiet: bool) -> Iterator[Progress]:
         yield progress
 
 
-def _await_first_cloud(
+def _await_ready(
     launcher: Launcher, watch: Watch, asked: Asked, stack: Stack, progress: Progress, began_s: float
 ) -> None:
-    from endo3d.services.runtime.errors import UserError
-    from endo3d.services.runtime.launcher import State
-
-    task = progress.add_task("starting", total=len(stack.tables))
     names = list(stack.tables)
-    while not watch.clouds and not (launcher.done or asked.times):
-        launcher.turn(0.05)
-        missing = watch.starting(names)
-        what = f"starting {', '.join(missing)}" if missing else "waiting for the first cloud"
-        progress.update(task, completed=len(names) - len(missing), description=what)
-        if fallen := [child.name for child in launcher.children if child.state is State.GIVEN_UP]:
-            raise UserError(f"{', '.join(fallen)} keeps crashing; its lines above say why")
-        if time.monotonic() - began_s > START_LIMIT_S:
-            raise UserError(f"no cloud after {START_LIMIT_S:.0f} s; endo3d doctor checks this machine")
+    task = progress.add_task("starting", total=len(names))
+    while (missing := watch.starting(names)) and not (launcher.done or asked.times or watch.clouds):
+        progress.update(task, completed=len(names) - len(missing), description=f"starting {', '.join(missing)}")
+        _turn_or_give_up(launcher, began_s)
     progress.remove_task(task)
 
 
-def _scan(
-    launcher: Launcher, watch: Watch, asked: Asked, stack: Stack, progress: Progress, seconds: float
-) -> float:
+def _await_first_cloud(launcher: Launcher, watch: Watch, asked: Asked, progress: Progress, began_s: float) -> None:
+    task = progress.add_task("waiting for the first cloud", total=None)
+    while not watch.clouds and not (launcher.done or asked.times):
+        _turn_or_give_up(launcher, began_s)
+    progress.remove_task(task)
+
+
+def _turn_or_give_up(launcher: Launcher, began_s: float) -> None:
+    from endo3d.services.runtime.errors import UserError
+    from endo3d.services.runtime.launcher import State
+
+    launcher.turn(0.05)
+    if fallen := [child.name for child in launcher.children if child.state is State.GIVEN_UP]:
+        raise UserError(launcher.user_error or f"{', '.join(fallen)} keeps crashing; its lines above say why")
+    if time.monotonic() - began_s > START_LIMIT_S:
+        raise UserError(f"no cloud after {START_LIMIT_S:.0f} s; endo3d doctor checks this machine")
+
+
+def _scan(launcher: Launcher, watch: Watch, asked: Asked, stack: Stack, progress: Progress, seconds: float) -> float:
     """Until the time is over, somebody asks, or the stack is done; seconds scanned."""
     task = progress.add_task("scanning", total=seconds)
     began_s = time.monotonic()

@@ -26,6 +26,8 @@ class Watch:
         self.valid_share = 0.0
         self.tracking = ""
         self.statuses: dict[str, Status] = {}
+        self._cpu_shares: dict[str, list[float]] = {}
+        """Of every second in which a service worked."""
         self._arrival = threading.Condition()
         bus.subscribe(topics.CLOUD, self._cloud)
         bus.subscribe(topics.POSE, self._pose)
@@ -50,18 +52,25 @@ class Watch:
         assert isinstance(message, Status)
         with self._arrival:
             self.statuses[message.service] = message
+            if message.state is not ServiceState.STARTING:
+                self._cpu_shares.setdefault(message.service, []).append(message.cpu_share)
             self._arrival.notify_all()
 
     def starting(self, services: list[str]) -> list[str]:
         """Those that have not said they are ready."""
         return [
-            name
-            for name in services
-            if name not in self.statuses or self.statuses[name].state is ServiceState.STARTING
+            name for name in services if name not in self.statuses or self.statuses[name].state is ServiceState.STARTING
         ]
 
     def rate_hz(self, service: str) -> float:
         return self.statuses[service].rate_hz if service in self.statuses else 0.0
+
+    def loads(self) -> dict[str, dict[str, float]]:
+        """service -> mean share of a core and last memory."""
+        return {
+            name: {"cpu_percent": 100 * float(np.mean(shares)), "memory_mb": self.statuses[name].memory_mb}
+            for name, shares in sorted(self._cpu_shares.items())
+        }
 
     def lost(self) -> dict[str, dict[str, int]]:
         """service -> cause -> count, of everything that was lost."""

@@ -1,0 +1,63 @@
+"""The whole stack at the paper's hand-guided rate: 26 s of prerendered 1920 x 1200 frames at 172 Hz.
+
+A log plays the camera; decoder, odometry, recorder and viewer run as processes, and this one listens to the
+clouds. Goals: no lost frame; frame to cloud p99 within 3 frame periods beyond the decoder's own window. The
+frames (10 GB) are rendered once, into build/bench.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+from endo3d.schemas import topics
+from endo3d.services.archive.reader import Log
+from endo3d.services.cli.demo import scan
+from endo3d.services.runtime.bus import Bus
+
+SCENE = "contour texture=noise:0.15:0.15"
+RATE_HZ, SECONDS = 172.0, 26.0
+PERIODS = 3
+FRAMES = Path("build/bench/contour-172hz.mcap")
+READERS = ("decoder", "odometry", "recorder")
+
+
+def main() -> None:
+    if not FRAMES.exists():
+        FRAMES.parent.mkdir(parents=True, exist_ok=True)
+        endo3d = [sys.executable, "-m", "endo3d.services.cli.app", "render", SCENE, "-o", str(FRAMES)]
+        subprocess.run([*endo3d, "--preset", "fast", "--rate", str(RATE_HZ), "--seconds", str(SECONDS)], check=True)
+    rendered = Log(FRAMES).count(topics.FRAME)
+    with tempfile.TemporaryDirectory(dir=FRAMES.parent) as folder:
+        settings = [f"rig.name=stack{os.getpid()}", f"player.log={FRAMES.resolve()}", "viewer.port=0"]
+        settings += [f"recorder.directory={folder}", "recorder.name=scan", "viewer.web_port=0"]
+        settings += ["player.rate=0"]  # until everybody is ready
+        run = scan("player", settings, seconds=10 * SECONDS, quiet=True, when_ready=play)
+        recorded = Log(Path(folder) / "scan.mcap")
+        counts = {topic.name: recorded.count(topic) for topic in (topics.FRAME, topics.POSE)}
+    print(f"first cloud {run['start_s']:.1f} s after the command, then {run['scan_s']:.1f} s at {RATE_HZ:g} Hz")
+    print(
+        f"frames rendered {rendered}, recorded {counts['frame']}; poses recorded {counts['pose']}; clouds {run['clouds']}"
+    )
+    for name in READERS:
+        lost = run["lost"].get(name, {})
+        said = ", ".join(f"{cause} {count}" for cause, count in lost.items()) or "nothing"
+        print(f"lost in {name:<10} {said}")
+    cloud, goal_ms = run["latency_cloud_ms"], 1e3 * PERIODS / RATE_HZ
+    print(f"newest frame to cloud  p50 {cloud['p50']:.1f} ms, p99 {cloud['p99']:.1f} ms (goal {goal_ms:.1f} ms)")
+    print(
+        f"newest frame to pose   p50 {run['latency_pose_ms']['p50']:.1f} ms, p99 {run['latency_pose_ms']['p99']:.1f} ms"
+    )
+    for name, status in run["services"].items():
+        print(f"{name:<10} {status['cpu_percent']:5.0f} % of a core, {status['memory_mb']:6.0f} MB")
+
+
+def play(bus: Bus) -> None:
+    bus.call("player", "rate", {"rate": 1.0})
+
+
+if __name__ == "__main__":
+    main()
