@@ -85,9 +85,7 @@ def message_head(channel: int, sequence: int, log_ns: int, publish_ns: int, size
     )
 
 
-def message_indexes(
-    entries: Mapping[int, Sequence[tuple[int, int]]], at: int
-) -> tuple[bytes, dict[int, int]]:
+def message_indexes(entries: Mapping[int, Sequence[tuple[int, int]]], at: int) -> tuple[bytes, dict[int, int]]:
     """The message indexes of a chunk, to stand at offset ``at``, and where each channel's begins.
 
     entries: channel -> (log time, offset within the records) of its messages.

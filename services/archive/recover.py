@@ -93,9 +93,7 @@ class _Inventory:
 
     def report(self, path: Path, lost_bytes: int, *, was_whole: bool = False) -> Report:
         summary = self.summary
-        return Report(
-            path, summary.messages, summary.chunks, lost_bytes, tuple(self.damages), None, was_whole
-        )
+        return Report(path, summary.messages, summary.chunks, lost_bytes, tuple(self.damages), None, was_whole)
 
 
 def _inventory(view: memoryview, path: Path) -> _Inventory:
@@ -194,9 +192,7 @@ def _write_anew(view: memoryview, path: Path, out: Path | None, inventory: _Inve
                     channel = writer.channel(definition.topic, kind, definition.metadata)
                     channels[definition.id] = channel
                 case Attachment():
-                    writer.attach(
-                        definition.name, definition.media_type, definition.data, definition.log_time
-                    )
+                    writer.attach(definition.name, definition.media_type, definition.data, definition.log_time)
                 case Metadata():
                     writer.note(definition.name, definition.metadata)
         if isinstance(item, FoundChunk):
@@ -209,9 +205,7 @@ def _write_anew(view: memoryview, path: Path, out: Path | None, inventory: _Inve
         target.replace(path)
     summary = inventory.summary
     lost = len(view) - inventory.whole_bytes
-    return Report(
-        out or path, summary.messages, summary.chunks, lost, tuple(inventory.damages), damaged_copy, False
-    )
+    return Report(out or path, summary.messages, summary.chunks, lost, tuple(inventory.damages), damaged_copy, False)
 
 
 def _copy_messages(chunk: FoundChunk, channels: dict[int, int], writer: Writer) -> None:

@@ -116,9 +116,7 @@ def walk(view: memoryview) -> Iterator[Found | FoundChunk | Damage]:
 _KNOWN_FIRST, _KNOWN_LAST = int(Opcode.HEADER), int(Opcode.DATA_END)
 
 
-def _read(
-    view: memoryview, at: int, opcode: int, body_at: int, end: int
-) -> Found | FoundChunk | Damage | None:
+def _read(view: memoryview, at: int, opcode: int, body_at: int, end: int) -> Found | FoundChunk | Damage | None:
     body = view[body_at:end]
     try:
         match opcode:
@@ -163,9 +161,7 @@ def _chunk(body: memoryview, at: int, length: int) -> FoundChunk | Damage:
         elif opcode == Opcode.CHANNEL:
             definitions.append(Channel.read(_stream(records[offset + layout.RECORD.size : after])))
         offset = after
-    return FoundChunk(
-        at, length, start_ns, end_ns, name, compressed_size, records, dict(entries), definitions
-    )
+    return FoundChunk(at, length, start_ns, end_ns, name, compressed_size, records, dict(entries), definitions)
 
 
 def _stream(body: memoryview) -> ReadDataStream:
