@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from endo3d_core import health, rigid
 from endo3d_core.live_view import LiveView
 from endo3d_core.merging import MergedMap
-from endo3d_core.registration import Frame6, Linearisation, Scales, visible_surface
+from endo3d_core.recovery import recover
+from endo3d_core.registration import Frame6, Linearisation, NormalEquations, Scales, visible_surface
 
 Array = NDArray[np.float64]
 
@@ -23,6 +24,10 @@ _COARSE = 4
 _LEAST_SHARE = 0.35
 """Of the visible map points that must agree with the cloud."""
 _LEAST_POINTS = 300
+_LEAST_SLOPE = 0.6
+"""Where there is texture: least slope of the cloud's over the map's; at a wrong place it is zero."""
+_PATIENCE = 30
+"""Clouds that may fail to recover before a new submap begins."""
 _LEAST_TEXTURE = 0.001
 """Relative brightness: far below any camera's noise, it keeps the robust scale from being zero."""
 _LONGEST_GAP = 6.0
@@ -72,75 +77,109 @@ class Odometry:
         self._scale_mm = np.nan
         self._texture_scale = 0.1
         self.submap = 0
+        self._failures = 0
+        self._visible = self.map.touched
 
     def track(self, channels: NDArray[np.float32], sequence: int, stamp_ns: int) -> Estimate:
         """One cloud (height, width, 6) float32: x y z mm, intensity, quality, sigma mm."""
-        try:
-            self.view.load(channels)
-        except ValueError:
-            return self._lost(0.0, np.nan)
+        if self._load(channels) < _LEAST_POINTS:
+            return self._lost()
         if self._last_ns is None:
             return self._begin(sequence, stamp_ns)
-        predicted = self._predict(stamp_ns)
-        estimate = self._register(predicted, stamp_ns)
-        if estimate.state is not State.LOST:
+        estimate = None if self._is_lost(stamp_ns) else self._register(self._predict(stamp_ns), stamp_ns)
+        if estimate is not None:
             self.map.merge(self.view.live, estimate.T_world_camera, sequence)
-        return estimate
+            self._visible = self.map.touched
+            return estimate
+        return self._recover(sequence, stamp_ns)
+
+    def _load(self, channels: NDArray[np.float32]) -> int:
+        """The number of pooled points; 0 also when nothing can be told from the cloud."""
+        try:
+            return self.view.load(channels)
+        except ValueError:
+            return 0
 
     def _begin(self, sequence: int, stamp_ns: int) -> Estimate:
         self._last_ns = stamp_ns
         self._scale_mm = 2.0 * self.view.sigma_mm
         self.map.merge(self.view.live, self.T_world_camera, sequence)
+        self._visible = self.map.touched
         return Estimate(
             self.T_world_camera, np.diag(np.full(6, 1e12)), State.TRACKING, 0.0, np.zeros(6), 1.0, 0.0, 0.0, self.submap
         )
 
-    def _predict(self, stamp_ns: int) -> Array:
+    def _is_lost(self, stamp_ns: int) -> bool:
+        """Also after a gap: what comes back may look like another place."""
         assert self._last_ns is not None
         gap_ns = stamp_ns - self._last_ns
-        if not 0 < gap_ns <= _LONGEST_GAP * self._period_ns:
-            return self.T_world_camera
-        return self.T_world_camera @ rigid.exp(self._velocity * gap_ns)
+        return self._failures > 0 or gap_ns <= 0 or (gap_ns > _LONGEST_GAP * self._period_ns > 0)
 
-    def _register(self, predicted: Array, stamp_ns: int) -> Estimate:
+    def _predict(self, stamp_ns: int) -> Array:
+        assert self._last_ns is not None
+        return self.T_world_camera @ rigid.exp(self._velocity * (stamp_ns - self._last_ns))
+
+    def _recover(self, sequence: int, stamp_ns: int) -> Estimate:
+        """Wide search against the map; a new submap when that keeps failing."""
+        self._failures += 1
+        found = recover(self.view, self.map, self.T_world_camera, self._equations)
+        if found is not None:
+            self._failures = 0
+            self.T_world_camera, self._last_ns = rigid.orthonormal(found.T_world_camera), stamp_ns
+            self._velocity[:] = 0.0
+            self._visible = found.visible
+            self._scale_mm, self._texture_scale = found.equations.residual_mm, found.equations.texture_residual
+            return self._estimate(State.RELOCALISED, found.equations, found.solution, found.frame)
+        if self._failures > _PATIENCE:
+            self._failures = 0
+            self.submap += 1
+            self.map.clear()
+            return self._begin(sequence, stamp_ns)
+        return self._lost()
+
+    def _register(self, predicted: Array, stamp_ns: int) -> Estimate | None:
+        """Gauss-Newton from the predicted pose; None when the result does not hold."""
         view, sigma_mm = self.view, self.view.sigma_mm
         frame = visible_surface(view.live)
-        T, rows = predicted, self.map.touched
+        T, rows = predicted, self._visible
         gate_mm = 8.0 * self._scale_mm + view.pitch_mm
         scales = Scales(gate_mm, 0.5 * gate_mm, 4.0 * self._texture_scale, view.normal_rad)
         for iteration in range(ITERATIONS):
             chosen = rows if iteration else rows[::_COARSE]
             n = self._equations.at(T, self.map, chosen, view.live, view.coefficients, frame, scales)
             if n.used < _LEAST_POINTS:
-                return self._lost(0.0, np.nan)
+                return None
             solution = health.solve(n, sigma_mm)
             T = T @ health.motion(solution.step, frame)
             scale_mm = max(n.residual_mm, sigma_mm)
             scales = Scales(8.0 * scale_mm, scale_mm, max(n.texture_residual, _LEAST_TEXTURE), view.normal_rad)
             if iteration and np.linalg.norm(solution.step) < _CONVERGED * sigma_mm:
                 break
-        share = n.used / max(n.visible, 1)
-        if share < _LEAST_SHARE:
-            return self._lost(share, n.residual_mm)
+        if n.used < _LEAST_SHARE * n.visible or (n.textured_scene and n.texture_slope < _LEAST_SLOPE):
+            return None
         self._scale_mm, self._texture_scale = min(scale_mm, 4.0 * sigma_mm), scales.texture
-        T = rigid.orthonormal(T)
-        self._advance(T, stamp_ns, solution.held, frame)
+        self._advance(rigid.orthonormal(T), stamp_ns, solution.held, frame)
+        return self._estimate(State.DEGENERATE if solution.held.size else State.TRACKING, n, solution, frame)
+
+    def _estimate(
+        self, state: State, n: NormalEquations, solution: health.Solution, frame: Frame6
+    ) -> Estimate:
         return Estimate(
-            T_world_camera=T,
+            T_world_camera=self.T_world_camera,
             information=health.at_camera(solution.information, frame),
-            state=State.DEGENERATE if solution.held.size else State.TRACKING,
+            state=state,
             sigma_weak_mm=solution.sigma_weak_mm,
             weak_direction=solution.weak_direction,
-            inlier_share=share,
+            inlier_share=n.used / max(n.visible, 1),
             residual_mm=n.residual_mm,
             photometric_share=solution.photometric_share,
             submap=self.submap,
         )
 
-    def _lost(self, share: float, residual_mm: float) -> Estimate:
+    def _lost(self) -> Estimate:
         """The last pose, and no information."""
         return Estimate(
-            self.T_world_camera, np.zeros((6, 6)), State.LOST, np.inf, np.zeros(6), share, residual_mm, 0.0, self.submap
+            self.T_world_camera, np.zeros((6, 6)), State.LOST, np.inf, np.zeros(6), 0.0, np.nan, 0.0, self.submap
         )
 
     def _advance(self, T: Array, stamp_ns: int, held: Array, frame: Frame6) -> None:

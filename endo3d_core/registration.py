@@ -28,6 +28,9 @@ GRAZING = 0.3
 FACING = 0.9
 """Least view cosine of a photometric row: on flanks, shading changes with the pose."""
 
+SETTLED = 16
+"""Measured points from which on a map point's texture is compared as a whole: its noise is a quarter of one's."""
+
 _SURFACE_ROWS = 11
 """J (6), distance, then 1 and the scaled position (3) weighted with the noise of the normal."""
 _TEXTURE_ROWS = 13
@@ -81,6 +84,15 @@ class NormalEquations:
     """Robust rms of the distances."""
     texture_residual: float
     """The same of the differences in texture, at the cloud's typical brightness."""
+    texture_slope: float
+    """Of the cloud's texture over the map's: 1 where they match, 0 at a wrong place."""
+    texture_rms: float
+    """Of the map's texture: its contrast."""
+
+    @property
+    def textured_scene(self) -> bool:
+        """The map's texture stands out of the differences: more than noise averaged over ``SETTLED`` points."""
+        return self.texture_rms > 0.5 * self.texture_residual
 
 
 def visible_surface(live: NDArray[np.float32], stride: int = 4) -> Frame6:
@@ -112,11 +124,13 @@ class Linearisation:
         if self._surface.shape[1] < len(chosen):
             self._surface = np.empty((_SURFACE_ROWS, len(chosen)), np.float32)
             self._texture = np.empty((_TEXTURE_ROWS, len(chosen)), np.float32)
-        visible, used, textured, squares, weights, texture_squares, texture_weights = _rows(
+        counts, sums = _rows(
             world.rows, world.ints, chosen, live, coefficients, rigid.inverse(T_world_camera),
             frame.centre, frame.radius_mm, scales.gate_mm, scales.distance_mm, scales.texture, scales.normal_rad,
             self._surface, self._texture,
         )  # fmt: skip
+        visible, used, textured, settled = counts
+        squares, weights, texture_squares, texture_weights, of_map, of_both = sums
         surface = _gram(self._surface[:7], used)
         tilted = _gram(self._surface[7:], used)
         texture = _gram(self._texture, textured)
@@ -135,6 +149,8 @@ class Linearisation:
             textured=textured,
             residual_mm=float(np.sqrt(squares / max(weights, 1e-30))),
             texture_residual=float(np.sqrt(texture_squares / max(texture_weights, 1e-30))),
+            texture_slope=of_both / max(of_map, 1e-30),
+            texture_rms=float(np.sqrt(of_map / max(settled, 1))),
         )
 
 
@@ -184,8 +200,8 @@ def _rows(  # type: ignore[no-untyped-def]
     per_texture2 = f(1.0 / (texture_scale * texture_scale))
     tilt_scale = f(normal_sigma)
     rows, columns = live.shape[0], live.shape[1]
-    visible = used = texture_used = 0
-    squares = weights = texture_squares = texture_weights = 0.0
+    visible = used = texture_used = settled = 0
+    squares = weights = texture_squares = texture_weights = of_map = of_both = 0.0
     for i in range(chosen.size):
         m = map_rows[chosen[i]]
         x = r00 * m[0] + r01 * m[1] + r02 * m[2] + tx
@@ -247,10 +263,15 @@ def _rows(  # type: ignore[no-untyped-def]
         du, dv = abs(du), abs(dv)
         here = (one - du) * q[6] + du * live[row, aside, 6]
         there = (one - du) * live[below, column, 6] + du * live[below, aside, 6]
-        difference = (one - dv) * here + dv * there - m[9]
+        texture = (one - dv) * here + dv * there
+        difference = texture - m[9]
         squared = difference * difference * q[12]
         if not squared < one:
             continue
+        if count >= f(SETTLED):
+            of_map += m[9] * m[9]
+            of_both += m[9] * texture
+            settled += 1
         robust = one / (one + f(0.25) * squared * per_texture2)
         robust *= robust
         texture_squares += robust * squared
@@ -270,4 +291,5 @@ def _rows(  # type: ignore[no-untyped-def]
         textured[11, texture_used] = sx * hy - sy * hx
         textured[12, texture_used] = -w * difference
         texture_used += 1
-    return visible, used, texture_used, squares, weights, texture_squares, texture_weights
+    sums = (squares, weights, texture_squares, texture_weights, of_map, of_both)
+    return (visible, used, texture_used, settled), sums
