@@ -11,7 +11,11 @@ from pydantic import Field
 from endo3d.schemas import topics
 from endo3d.schemas.messages import Cloud, MapDelta, Message, Pose, ProjectorCalibration, Tracking, Transform
 from endo3d.services.runtime.service import Config, Refused, Service
+from endo3d.services.views.colouring import visible
 from endo3d_core import merging, odometry, rigid
+
+SHOWN_RELIEF_MM = 3.0
+"""Heights that the colours of the published map tell apart, around the first points' median."""
 
 
 class OdometryConfig(Config):
@@ -36,6 +40,7 @@ class Odometry(Service[OdometryConfig]):
         super().__init__(config)
         self.odometry = self._fresh()
         self._revision = 0
+        self._relief_mm: tuple[float, float] | None = None
         self._next_map_ns = 0
         self._sequence = 0
         self._states: dict[str, int] = dict.fromkeys(Tracking, 0)
@@ -109,10 +114,13 @@ class Odometry(Service[OdometryConfig]):
 
     def _map_delta(self, delta: merging.Delta, stamp_ns: int, *, reset: bool) -> MapDelta:
         self._revision += 1
+        if self._relief_mm is None and len(delta.points):
+            middle_mm = -float(np.median(delta.points["z"]))
+            self._relief_mm = (middle_mm - SHOWN_RELIEF_MM / 2, middle_mm + SHOWN_RELIEF_MM / 2)
         return MapDelta(
             stamp_ns=stamp_ns,
             sequence=self._sequence,
-            points=delta.points,
+            points=visible(delta.points, *(self._relief_mm or (0.0, 1.0))),
             removed=delta.removed,
             revision=self._revision,
             reset=reset,

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from endo3d.schemas import messages as m
+from endo3d.services.views.colouring import visible
 from endo3d_core.merging import MAP_POINT
 
 START_NS = 1_700_000_000_123_456_789
@@ -90,7 +91,7 @@ def messages(
             stamp_ns,
         )
         yield m.Transform(stamp_ns, "world", "camera", T)
-        rows = map_of(points)
+        rows = visible(map_of(points), -21.0, -19.0)
         yield m.MapDelta(stamp_ns, k, rows, np.zeros((0, 3), np.int16), k, k == 0, len(rows), 0.2)
         yield m.Status(
             stamp_ns, "decoder", "host", 1, m.ServiceState.RUNNING, "", 25.0, 9.0, 14.0, 0.4, 120.0

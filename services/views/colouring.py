@@ -12,7 +12,8 @@ from endo3d.services.views.colour import coloured, spread
 from endo3d.services.views.principal import heights_mm
 from endo3d.services.views.scan import xyz
 
-CHOICES = ("height", "quality", "deviation")
+RGBA = ("red", "green", "blue", "alpha")
+"""The fields by which Foxglove and Rerun know a point's colour, uint8 each."""
 
 
 @dataclass(frozen=True)
@@ -63,3 +64,21 @@ def colouring(
             raise ValueError("colour by deviation needs one deviation_um per point")
         return by_deviation(deviation_um)
     return by_quality(points) if colour == "quality" else by_height(points, viewer)
+
+
+def visible(points: NDArray[Any], low: float, high: float) -> NDArray[Any]:
+    """A copy of structured points with a colour of their own, for viewers that know nothing of endo3d.
+
+    By height towards the first camera, -z, over ``low``..``high`` mm.
+    """
+    names = points.dtype.names or ()
+    coloured_points = np.empty(
+        points.shape, [(name, points.dtype[name]) for name in names] + [(name, np.uint8) for name in RGBA]
+    )
+    for name in names:
+        coloured_points[name] = points[name]
+    rgb = coloured(-points["z"], low, high, "height")
+    for k, name in enumerate(RGBA[:3]):
+        coloured_points[name] = rgb[..., k]
+    coloured_points["alpha"] = 255
+    return coloured_points

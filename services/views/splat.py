@@ -40,6 +40,8 @@ class Eye:
 
 
 TILT_DEG, TURN_DEG = 52.0, 24.0
+NEAREST = 0.3
+"""The eye keeps this share of the points' extent away from the first of them."""
 
 
 def oblique(axes: NDArray[np.floating]) -> NDArray[np.float64]:
@@ -68,6 +70,7 @@ def looking(
     half = np.array([width, height]) / 2 * (1 - 2 * margin) / focal
     # each point asks for |x - cx| <= half_x (z - cz), likewise y: the tightest planes fix centre and distance
     cz = min(
+        float(z.min()) - NEAREST * float(np.linalg.norm(np.ptp(at, axis=0))),  # never inside the cloud
         (np.min(x + half[0] * z) - np.max(x - half[0] * z)) / (2 * half[0]),
         (np.min(y + half[1] * z) - np.max(y - half[1] * z)) / (2 * half[1]),
     )

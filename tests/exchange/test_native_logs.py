@@ -10,10 +10,11 @@ from rerun.chunk import McapReader
 from scans import K, messages, pose_of
 
 from endo3d.schemas import codec, topics
-from endo3d.schemas.messages import Cloud, Frame
+from endo3d.schemas.messages import Cloud, Frame, MapDelta
 from endo3d.services.archive.entry import Entry
 from endo3d.services.archive.recording import Recording
 from endo3d.services.archive.writer import Kind
+from endo3d.services.views.colour import TABLES, packed
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +57,14 @@ def test_clouds_are_points(log: Path) -> None:
     valid = cloud.points[np.isfinite(cloud.points["z"])]
     finite = positions[np.isfinite(positions).all(axis=1)]
     np.testing.assert_array_equal(finite, np.stack([valid[a] for a in "xyz"], axis=1))
-    assert column(log, "/map", "Points3D:positions")
+
+
+def test_the_map_has_its_colours_by_height(log: Path) -> None:
+    delta = next(message for message in messages(4) if isinstance(message, MapDelta))
+    colours = np.array(column(log, "/map", "Points3D:colors")[0])
+    rgb = TABLES["height"][np.clip((21 - delta.points["z"]) * (255 / 2), 0, 255).astype(np.uint8)]
+    np.testing.assert_array_equal(colours, packed(rgb))
+    assert len(np.unique(colours)) > 50
 
 
 def test_depth_maps_are_images_too(log: Path) -> None:
