@@ -8,9 +8,10 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from endo3d_core.virtual_rig import profile, sphere
-from endo3d_core.virtual_rig.profile import Profile, View
-from endo3d_core.virtual_rig.scene import Shape, Sphere
+from endo3d_core.virtual_rig import freeform, profile, sphere
+from endo3d_core.virtual_rig.mesh import Mesh
+from endo3d_core.virtual_rig.profile import FAR_MM, Profile, View
+from endo3d_core.virtual_rig.scene import Freeform, Shape, Sphere
 
 BIAS_MM = np.float32(0.004)
 """A surface point must lie this far behind another one to be in its shadow."""
@@ -60,6 +61,10 @@ def sight(shape: Shape, T_body_camera: NDArray[np.float64], field: Field) -> Sig
             return ProfileSight(shape, T_body_camera, field)
         case Sphere():
             return SphereSight(shape, T_body_camera, field)
+        case Freeform():
+            return FreeformSight(shape, T_body_camera)
+        case Mesh():
+            return MeshSight(shape, T_body_camera, field)
 
 
 def cast_exact(
@@ -76,6 +81,11 @@ def cast_exact(
             profile.cast_exact(shape.primitives, T, rx, ry, z)
         case Sphere():
             sphere.cast_exact(shape.radius_mm, T, rx, ry, z)
+        case Freeform():
+            freeform.cast_exact(shape.parameters, T, rx, ry, z)
+        case Mesh():
+            directions = np.stack((rx, ry, np.ones_like(rx)), axis=-1) @ T[:3, :3].T
+            np.minimum(z, shape.first(T[:3, 3], directions)[0], out=z)
 
 
 def distances(shape: Shape, points: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -88,6 +98,12 @@ def distances(shape: Shape, points: NDArray[np.float64]) -> NDArray[np.float64]:
             return out
         case Sphere():
             return np.asarray(np.linalg.norm(points, axis=1) - shape.radius_mm)
+        case Freeform():
+            out = np.empty(len(points))
+            freeform.distances(shape.parameters, points, out)
+            return out
+        case Mesh():
+            return shape.distances(points)
 
 
 class ProfileSight:
@@ -132,3 +148,40 @@ class SphereSight:
     def shadow(self, chunk: Chunk) -> None:
         c = chunk
         sphere.shadow(self.centre, self.radius, self.lamp, BIAS_MM, c.rx, c.ry, c.z, c.lit)
+
+
+class FreeformSight:
+    def __init__(self, shape: Freeform, T: NDArray[np.float64]) -> None:
+        self.parameters, self.T = shape.parameters.astype(np.float32), T.astype(np.float32)
+
+    def cast(self, chunk: Chunk, index: np.uint8) -> None:
+        c = chunk
+        freeform.cast(self.parameters, self.T, c.rx, c.ry, c.z, c.nx, c.ny, c.nz, c.body, index)
+
+    def shadow(self, chunk: Chunk) -> None:
+        """None: the surface is convex."""
+
+
+class MeshSight:
+    def __init__(self, shape: Mesh, T: NDArray[np.float64], field: Field) -> None:
+        self.shape, self.T = shape, T
+        self.lamp = T[:3, :3] @ field.projector_centre_mm + T[:3, 3]
+
+    def cast(self, chunk: Chunk, index: np.uint8) -> None:
+        c = chunk
+        rays = np.stack((c.rx, c.ry, np.ones_like(c.rx)), axis=-1).astype(np.float64)
+        depth, triangle = self.shape.first(self.T[:3, 3], rays @ self.T[:3, :3].T)
+        nearer = depth < c.z
+        normals = self.shape.normals[triangle[nearer]] @ self.T[:3, :3]
+        # Meshes may be wound either way: what is seen faces the camera.
+        normals *= -np.sign(np.einsum("ij,ij->i", normals, rays[nearer]))[:, None]
+        c.z[nearer], c.body[nearer] = depth[nearer], index
+        c.nx[nearer], c.ny[nearer], c.nz[nearer] = normals.T
+
+    def shadow(self, chunk: Chunk) -> None:
+        c = chunk
+        seen = np.flatnonzero(c.z < FAR_MM / 2)
+        points = c.z[seen, None] * np.stack((c.rx[seen], c.ry[seen], np.ones(len(seen))), axis=-1)
+        away = points @ self.T[:3, :3].T + self.T[:3, 3] - self.lamp
+        advance, _ = self.shape.first(self.lamp, away)
+        c.lit[seen[(1.0 - advance) * np.linalg.norm(away, axis=1) > BIAS_MM]] = 0.0

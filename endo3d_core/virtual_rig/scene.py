@@ -5,6 +5,8 @@
     cylinder r=1 at=0,0,20              its axis along y; the half that faces the sensor
     steps heights=0.05/0.1/0.2/0.5 width=1.5
     contour                             the micro-contour standard of the paper
+    blade size=1                        a freeform surface like a turbine blade's, 10 mm of chord
+    mesh file=part.stl scale=1          any STL or PLY mesh, in mm; z points away from the sensor
     sphere r=1 at=0,0,19 + plane z=20
 
 Of every body: ``at=x,y,z`` (mm, in the camera's axes at time 0; z defaults to the working distance),
@@ -16,12 +18,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from endo3d_core.virtual_rig import freeform, mesh
 from endo3d_core.virtual_rig.contour_standard import contour_standard
 from endo3d_core.virtual_rig.material import METAL, Material, Texture
+from endo3d_core.virtual_rig.mesh import Mesh
 from endo3d_core.virtual_rig.motion import transform
 from endo3d_core.virtual_rig.profile import Contour, Profile
 from endo3d_core.virtual_rig.words import Words
@@ -36,7 +41,15 @@ class Sphere:
     radius_mm: float
 
 
-Shape = Profile | Sphere
+@dataclass(frozen=True, eq=False)
+class Freeform:
+    """A surface over the body's x and y."""
+
+    parameters: NDArray[np.float64]
+    """As ``freeform.blade`` makes them."""
+
+
+Shape = Profile | Sphere | Freeform | Mesh
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +71,7 @@ class Scene:
     bodies: tuple[Body, ...]
 
 
-KINDS = ("plane", "sphere", "cylinder", "steps", "contour")
+KINDS = ("plane", "sphere", "cylinder", "steps", "contour", "blade", "mesh")
 
 
 def parse(text: str, working_distance_mm: float = 20.0) -> Scene:
@@ -95,6 +108,13 @@ def _shape(words: Words) -> Shape:
             return _steps(words.numbers("heights", (0.05, 0.1, 0.2, 0.5)), _positive(words, "width", 1.5))
         case "contour":
             return contour_standard().profile()
+        case "blade":
+            return Freeform(freeform.blade(_positive(words, "size", 1.0)))
+        case "mesh":
+            path = words.text_of("file", "")
+            if not path:
+                raise ValueError("scene 'mesh' needs file=PART.stl (or .ply), without blanks in its name")
+            return mesh.load(Path(path), _positive(words, "scale", 1.0))
         case _:
             raise ValueError(f"unknown scene {words.kind!r}; it is one of: {', '.join(KINDS)}")
 

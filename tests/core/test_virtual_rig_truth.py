@@ -14,7 +14,7 @@ from endo3d_core import patterns
 from endo3d_core.calibration import Rig
 from endo3d_core.head import Head
 from endo3d_core.virtual_rig import contour_standard as standard
-from endo3d_core.virtual_rig import motion, scene
+from endo3d_core.virtual_rig import freeform, motion, scene
 from endo3d_core.virtual_rig.effects import IDEAL
 from endo3d_core.virtual_rig.renderer import Renderer
 from endo3d_core.virtual_rig.truth import Truth, distance, truth
@@ -136,9 +136,17 @@ def test_shadow_of_a_sphere_is_its_central_projection() -> None:
 
 
 @pytest.mark.parametrize(
-    "text", ["contour", "plane tilt=25", "sphere r=3 at=0,0,21", "cylinder r=2", "steps heights=0.1/0.5"]
+    "text", ["contour", "plane tilt=25", "sphere r=3 at=0,0,21", "cylinder r=2", "steps heights=0.1/0.5", "blade"]
 )
 def test_the_renderer_shows_the_true_phase(text: str) -> None:
+    check_phase(text)
+
+
+def test_the_renderer_shows_the_true_phase_of_a_mesh(ball_file: Path) -> None:
+    check_phase(f"mesh file={ball_file} at=0,0,21 + plane z=21.5")
+
+
+def check_phase(text: str) -> None:
     """Ideal frames of a phase-shifted pattern give back the truth's phase on every visible pixel."""
     rig, head = head_of("base6_wd20")
     what = scene.parse(text)
@@ -162,7 +170,7 @@ def test_the_renderer_shows_the_true_phase(text: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "text", ["contour", "plane tilt=20,10", "sphere r=2 + plane z=21", "cylinder r=1.5 turn=0,0,30"]
+    "text", ["contour", "plane tilt=20,10", "sphere r=2 + plane z=21", "cylinder r=1.5 turn=0,0,30", "blade"]
 )
 def test_distance_is_zero_on_the_surface_and_grows_along_its_normal(text: str) -> None:
     """True points have no distance; moved 50 um towards the camera they are in front by at most that."""
@@ -175,3 +183,49 @@ def test_distance_is_zero_on_the_surface_and_grows_along_its_normal(text: str) -
     assert moved.max() <= 0.05 + 1e-12
     assert moved.min() > -1e-9
     assert np.median(moved) > 0.04
+
+
+def test_points_of_a_blade_satisfy_its_equation() -> None:
+    result, points = seen("blade at=0.2,0.1,20", A_POSE)
+    ok = np.isfinite(result.depth_mm)
+    x, y, z = (points[ok] - (0.2, 0.1, 20.0)).T
+    a, b, c, d, e = freeform.BLADE
+    assert np.abs(z - (a * x**2 + b * x**3 + c * x**4 + d * y**2 + e * x * y)).max() < 1e-9
+    assert np.abs(x).max() <= 5.0
+    assert ok.sum() > 5000
+
+
+@pytest.fixture(scope="module")
+def ball_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finely triangulated sphere of 3 mm, centred on its origin."""
+    trimesh = pytest.importorskip("trimesh")
+    pytest.importorskip("embreex", reason="mesh scenes need Embree: pip install 'endo3d[mesh]'")
+    path = tmp_path_factory.mktemp("mesh") / "ball.stl"
+    trimesh.creation.icosphere(subdivisions=5, radius=3.0).export(path)
+    return path
+
+
+def test_a_mesh_is_seen_where_its_triangles_are(ball_file: Path) -> None:
+    """A mesh of a sphere agrees with the sphere to within the sagitta of its triangles, and with its own faces."""
+    result, points = seen(f"mesh file={ball_file} at=0,0,21", A_POSE)
+    ideal, _ = seen("sphere r=3 at=0,0,21", A_POSE)
+    both = np.isfinite(result.depth_mm) & np.isfinite(ideal.depth_mm)
+    assert both.sum() > 0.97 * np.isfinite(ideal.depth_mm).sum()
+    radius = np.linalg.norm(points[both] - (0, 0, 21.0), axis=1)
+    assert radius.max() <= 3.0 + 1e-6
+    assert radius.min() > 3.0 - 0.004
+    what = scene.parse(f"mesh file={ball_file} at=0,0,21")
+    some = points[both][::500]
+    assert np.abs(distance(what, some)).max() < 1e-6
+    assert distance(what, some - (0.0, 0.0, 0.1)).min() > 0.01
+
+
+def test_a_mesh_that_is_none_gets_one_line(tmp_path: Path) -> None:
+    (tmp_path / "empty.stl").write_bytes(b"solid nothing")
+    for text, hint in (
+        ("mesh", "needs file="),
+        (f"mesh file={tmp_path / 'absent.stl'}", "can't be read"),
+        (f"mesh file={tmp_path / 'empty.stl'}", "triangles|can't be read"),
+    ):
+        with pytest.raises(ValueError, match=hint):
+            scene.parse(text)
