@@ -31,6 +31,9 @@ class ViewerConfig(Config):
     save: Path | None = None
     """Also write this .rrd recording."""
     rate_hz: float = Field(30.0, gt=0, le=30)
+    """Of images and poses; nothing is shown faster."""
+    cloud_hz: float = Field(10.0, gt=0, le=30)
+    """Of single clouds and depth maps."""
     map_hz: float = Field(2.0, gt=0, le=30)
     colour: Literal["height", "quality"] = "height"
 
@@ -56,7 +59,7 @@ class Viewer(Service[ViewerConfig]):
 
     def __init__(self, config: ViewerConfig) -> None:
         super().__init__(config)
-        self.display = Display(config.rate_hz, config.map_hz, config.colour)
+        self.display = Display(config.rate_hz, config.cloud_hz, config.map_hz, config.colour)
         self.sinks: list[Sink] = []
         self.viewer: ViewerSink | None = None
         self.process: ViewerProcess | None = None
@@ -70,9 +73,7 @@ class Viewer(Service[ViewerConfig]):
                 self.process = ViewerProcess(self.config.port)
             case "web":
                 self.process = ViewerProcess(self.config.port, self.config.web_port)
-                log.info(
-                    "see the scan at %s or with: rerun --connect %s", self.process.page, self.process.url
-                )
+                log.info("see the scan at %s or with: rerun --connect %s", self.process.page, self.process.url)
             case "connect":
                 self._look_at(ViewerSink(self.config.url, scan_blueprint()))
         if self.process is not None:

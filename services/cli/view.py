@@ -87,13 +87,13 @@ def _deviation(scan: Scan) -> Callable[[NDArray[Any]], NDArray[np.float64]]:
 def _display(log: Log, colour: str) -> Display:
     from endo3d.schemas import topics
     from endo3d.services.views.display import Display
-    from endo3d.services.views.recording import MAP_HZ, RATE_HZ
+    from endo3d.services.views.recording import CLOUD_HZ, MAP_HZ, RATE_HZ
     from endo3d.services.views.scan import Scan
 
     if colour != "deviation":
-        return Display(RATE_HZ, MAP_HZ, colour)
+        return Display(RATE_HZ, CLOUD_HZ, MAP_HZ, colour)
     known = Scan.of(log.messages(topics.POSE, topics.TRUTH))
-    return Display(RATE_HZ, MAP_HZ, colour, _deviation(known))
+    return Display(RATE_HZ, CLOUD_HZ, MAP_HZ, colour, _deviation(known))
 
 
 def _write(log: Log, path: Path, colour: str) -> None:

@@ -21,16 +21,20 @@ from endo3d.services.views.splat import looking, oblique
 MOST_SHOWN = 400_000
 """Points of the merged map on the screen; of a larger map every k-th."""
 
+MOST_OF_WAY = 20_000
+"""Positions of the way on the screen; when there are more, every other is left out."""
 RERUN_FIELD_DEG = 68.0
 """Across Rerun's 3-D view of about 4 : 3."""
 
 
 class Display:
-    """What is on show: images, clouds, depth maps, poses at ``rate_hz``, map and way at ``map_hz``."""
+    """What is on show: images and poses at ``rate_hz``, clouds and depth maps at ``cloud_hz``, map and way at
+    ``map_hz``."""
 
     def __init__(
         self,
         rate_hz: float = 30.0,
+        cloud_hz: float = 10.0,
         map_hz: float = 2.0,
         colour: str = "height",
         deviation_um: Callable[[NDArray[Any]], NDArray[np.floating]] | None = None,
@@ -41,7 +45,8 @@ class Display:
         self.viewer = np.zeros(3)
         self.way: list[tuple[float, float, float]] = []
         self.merged = MergedMap()
-        self._period_ns = {"map": 1e9 / map_hz, "way": 1e9 / map_hz}
+        hz = {"cloud": cloud_hz, "depth": cloud_hz, "map": map_hz, "way": map_hz}
+        self._period_ns = {kind: 1e9 / min(rate, rate_hz) for kind, rate in hz.items()}
         self._most_ns = 1e9 / rate_hz
         self._shown_ns: dict[str, int] = {}
         self._camera: m.CameraCalibration | None = None
@@ -105,6 +110,8 @@ class Display:
             return
         x, y, z = self.viewer = pose.T_world_camera[:3, 3].copy()
         self.way.append((float(x), float(y), float(z)))
+        if len(self.way) > MOST_OF_WAY:
+            self.way = self.way[::2]
         yield from entries.pose(pose)
         if self._due("way", pose.stamp_ns):
             yield from entries.way(np.array(self.way, np.float32))

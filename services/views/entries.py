@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from endo3d.schemas import messages as m
 from endo3d.services.views.colour import packed, spread
-from endo3d.services.views.colouring import by_height, by_quality
+from endo3d.services.views.colouring import by_nearness, by_quality
 from endo3d.services.views.scan import xyz
 
 WORLD, CAMERA = "world", "world/camera"
@@ -99,7 +99,7 @@ def cloud(message: m.Cloud, colour: str) -> Iterator[Entry]:
     """The points of one measurement that are valid, in the camera frame: by quality, or else by height."""
     points = message.points[np.isfinite(message.points["z"])]
     if len(points):
-        shown = by_quality(points) if colour == "quality" else by_height(points, np.zeros(3))
+        shown = by_quality(points) if colour == "quality" else by_nearness(points)
         yield points_entry(CLOUD, xyz(points), shown.rgb(), CLOUD_RADIUS_MM)
 
 

@@ -10,14 +10,14 @@ from endo3d.services.views.blueprint import scan_blueprint
 from endo3d.services.views.display import Display
 from endo3d.services.views.sink import FileSink, Sink
 
-RATE_HZ, MAP_HZ = 15.0, 1.0
+RATE_HZ, CLOUD_HZ, MAP_HZ = 15.0, 10.0, 1.0
 
 
 def write_rrd(messages: Iterable[Message], path: str | Path, display: Display | None = None) -> None:
     """Writes messages in their order, thinned to 15 Hz, the map once a second and at the end."""
     sink = FileSink(Path(path), scan_blueprint())
     try:
-        play(messages, sink, display or Display(RATE_HZ, MAP_HZ))
+        play(messages, sink, display or Display(RATE_HZ, CLOUD_HZ, MAP_HZ))
     finally:
         sink.close()
 

@@ -81,7 +81,7 @@ def test_every_message_of_a_scan_can_be_shown() -> None:
 
 def test_a_step_yields_nothing_and_fills_the_recording(tmp_path: Path) -> None:
     path = tmp_path / "scan.rrd"
-    viewer = Viewer(ViewerConfig(show="none", save=path))
+    viewer = Viewer(ViewerConfig(show="none", save=path, cloud_hz=30))
     viewer.open()
     assert [out for message in messages() for out in viewer.step(message)] == []
     viewer.close()
