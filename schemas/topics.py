@@ -15,7 +15,7 @@ class Topic:
     message: type
     rate_hz: float
     """The most that is ever published."""
-    depth: int = 64
+    depth: int = 512
     """Samples a reader's queue holds before the oldest is dropped and counted."""
     bulk: bool = False
     """Large arrays: shared memory, ring queue and worker thread, a chunk of its own in the archive."""
@@ -41,13 +41,13 @@ CLOUD = Topic("cloud", m.Cloud, rate_hz=180, depth=4, bulk=True, log_hz=2)
 DEPTH = Topic("depth", m.DepthMap, rate_hz=180, depth=4, bulk=True, log_hz=30)
 POSE = Topic("pose", m.Pose, rate_hz=180)
 TRANSFORM = Topic("transform", m.Transform, rate_hz=180)
-MAP = Topic("map", m.MapDelta, rate_hz=30, depth=64)
+MAP = Topic("map", m.MapDelta, rate_hz=30)
 MODE = Topic("mode", m.Mode, rate_hz=10, latched=True)
 CAMERA = Topic("calibration/camera", m.CameraCalibration, rate_hz=1, latched=True)
 PROJECTOR = Topic("calibration/projector", m.ProjectorCalibration, rate_hz=1, latched=True)
 TRUTH = Topic("truth", m.Truth, rate_hz=180)
 STATUS = Topic("status", m.Status, rate_hz=2, per_service=True)
-LOG = Topic("log", m.LogLine, rate_hz=100, depth=256, per_service=True)
+LOG = Topic("log", m.LogLine, rate_hz=100, per_service=True)
 
 TOPICS = (FRAME, CLOUD, DEPTH, POSE, TRANSFORM, MAP, MODE, CAMERA, PROJECTOR, TRUTH, STATUS, LOG)
 BY_NAME = {topic.name: topic for topic in TOPICS}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -23,7 +24,9 @@ if TYPE_CHECKING:
     from endo3d.services.runtime.launcher import Launcher
     from endo3d.services.runtime.stack_file import Stack
 
-START_LIMIT_S = 180.0
+PATIENCE_S = 8.0
+"""A start that takes longer is explained, and so often again where nothing can be drawn."""
+START_LIMIT_S = 300.0
 """Compiling every kernel for the first time takes a while."""
 
 
@@ -37,8 +40,8 @@ def demo(
     """Scan the micro-contour standard on the virtual rig, and compare with the truth.
 
     Starts every service as a process of its own: projector sequence, camera, decoder, odometry, recorder,
-    viewer. A hand-guided scan is rendered live, in slow motion. At the end: a table, a log, the merged cloud,
-    a Rerun recording and a picture.
+    viewer. A hand-guided scan is rendered live, as fast as this machine can, so in slow motion. At the end: a
+    table, a log, the merged cloud, a Rerun recording and a picture.
 
     Examples: endo3d demo; endo3d demo --seconds 60 --out scan; endo3d demo --json
     """
@@ -46,7 +49,8 @@ def demo(
 
     folder = out or Path("out") / f"demo-{datetime.now(UTC):%Y%m%d-%H%M%S}"
     folder.mkdir(parents=True, exist_ok=True)
-    figures = scan(stack, [*(overrides or ()), *_recording(folder)], seconds, quiet=as_json)
+    settings = [*_recording(folder), *(overrides or ())]
+    figures = scan(stack, [*_pace(stack, settings, quiet=as_json), *settings], seconds, quiet=as_json)
     report = write(folder, figures)
     if as_json:
         print(json.dumps(report, indent=2))
@@ -57,6 +61,22 @@ def demo(
 
 def _recording(folder: Path) -> list[str]:
     return [f"recorder.directory={folder.resolve()}", "recorder.name=scan", "recorder.autostart=true"]
+
+
+def _pace(stack: str, settings: list[str], quiet: bool) -> list[str]:
+    """What makes the demo fit this machine, unless somebody has chosen a rate or a camera."""
+    from endo3d.services.cli import pace
+    from endo3d.services.runtime import stack_file
+
+    if any(setting.startswith(("sequencer.rate_hz=", "grabber.camera=")) for setting in settings):
+        return []
+    fitting = pace.measure(stack_file.load(stack, settings))
+    if fitting is None:
+        return []
+    if not quiet:
+        rate = f"{fitting.rate_hz:g} Hz, a scan at {pace.PAPER_HZ:g} Hz in slow motion {fitting.slow_motion:.1f}"
+        print(f"Rendering takes {fitting.render_ms:.1f} ms per frame here, now: {rate}.", file=sys.stderr)
+    return fitting.overrides()
 
 
 def scan(
@@ -140,8 +160,14 @@ def _await_ready(
 ) -> None:
     names = list(stack.tables)
     task = progress.add_task("starting", total=len(names))
+    say_at_s = time.monotonic() + PATIENCE_S
     while (missing := watch.starting(names)) and not (launcher.done or asked.times or watch.clouds):
-        progress.update(task, completed=len(names) - len(missing), description=f"starting {', '.join(missing)}")
+        spent_s = time.monotonic() - began_s
+        why = ": compiling their kernels, the first time only" if spent_s > PATIENCE_S else ""
+        progress.update(task, completed=len(names) - len(missing), description=f"starting {', '.join(missing)}{why}")
+        if time.monotonic() > say_at_s and not progress.console.is_terminal and not progress.disable:
+            progress.console.print(f"{spent_s:.0f} s: starting {', '.join(missing)}{why}", soft_wrap=True)
+            say_at_s += PATIENCE_S
         _turn_or_give_up(launcher, began_s)
     progress.remove_task(task)
 
