@@ -20,11 +20,9 @@ WEAK = 0.1
 """Geometry with a larger 1-sigma than this, in point sigmas, asks the texture for help."""
 HELD = 1.0
 """A direction that is known no better than a single point, 1-sigma in point sigmas, is not moved at all."""
-REPEATED = 1.0 - 1.0 / 1.4
-"""Least share of the cloud's texture gradients along a direction that the map shows too: their energy is then 1.4
-times that of their noise. Less is mostly shading, which moves with the camera."""
-SIGNIFICANT = 5.0
-"""The least agreement, in standard deviations of what chance would give."""
+SIGNAL = 1.0 - 1.0 / 1.4
+"""Least share of signal in the cloud's texture gradients along a direction: their energy is then 1.4 times that of
+their noise. Less is mostly shading, which moves with the camera."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,17 +74,14 @@ def solve(n: NormalEquations, sigma_mm: float) -> Solution:
 
 
 def _textured_directions(n: NormalEquations, weak: Array) -> Array:
-    """(6, k) orthonormal directions among ``weak`` along which map and cloud show the same texture."""
+    """(6, k) orthonormal directions among ``weak`` along which there is texture to follow."""
     if weak.size == 0 or n.textured == 0:
         return np.zeros((6, 0))
     _, mixed = np.linalg.eigh(weak.T @ n.texture @ weak)
     directions = weak @ mixed
-    common, of_map, of_live = (
-        np.einsum("ik,ij,jk->k", directions, information, directions)
-        for information in (n.texture, n.texture_map, n.texture_live)
-    )
-    by_chance = np.sqrt(of_map * of_live / n.textured)
-    chosen: Array = directions[:, (common > REPEATED * of_live) & (common > SIGNIFICANT * by_chance)]
+    signal = np.einsum("ik,ij,jk->k", directions, n.texture, directions)
+    of_live = np.einsum("ik,ij,jk->k", directions, n.texture_live, directions)
+    chosen: Array = directions[:, signal > SIGNAL * of_live]
     return chosen
 
 

@@ -70,12 +70,10 @@ class NormalEquations:
     geometry_noise: Array
     """The part of ``geometry`` that noisy normals alone would make."""
     texture: Array
-    """Of the gradients that map and cloud agree on: noise, independent in the two, cancels."""
+    """Of the photometric rows, without what grey noise alone would make."""
     texture_gradient: Array
-    texture_map: Array
-    """Of the map's gradients alone: more than ``texture`` by the map's noise."""
     texture_live: Array
-    """Of the cloud's gradients alone: more than ``texture`` by one cloud's noise."""
+    """Of the cloud's own texture gradients: more than ``texture`` by one cloud's noise."""
     visible: int
     """Map points that fall onto valid cells."""
     used: int
@@ -130,7 +128,7 @@ class Linearisation:
             self._surface, self._texture,
         )  # fmt: skip
         visible, used, textured, settled = counts
-        squares, weights, texture_squares, texture_weights, of_map, of_both = sums
+        squares, weights, texture_squares, texture_weights, of_map, of_both, inverse_counts = sums
         surface = _gram(self._surface[:7], used)
         tilted = _gram(self._surface[7:], used)
         texture = _gram(self._texture, textured)
@@ -140,9 +138,8 @@ class Linearisation:
             geometry=geometry,
             geometry_gradient=-surface[:6, 6],
             geometry_noise=_any_normal(tilted) - tilt_variance * geometry,
-            texture=0.5 * (texture[:6, 6:12] + texture[6:12, :6]),
+            texture=_signal(texture, textured / max(inverse_counts, 1e-30)),
             texture_gradient=-texture[:6, 12],
-            texture_map=texture[:6, :6],
             texture_live=texture[6:12, 6:12],
             visible=visible,
             used=used,
@@ -152,6 +149,21 @@ class Linearisation:
             texture_slope=of_both / max(of_map, 1e-30),
             texture_rms=float(np.sqrt(of_map / max(settled, 1))),
         )
+
+
+def _signal(texture: Array, count: float) -> Array:
+    """(6, 6) information of the texture's true gradients, from the Gram matrix (13, 13) of the photometric rows.
+
+    Cloud and map have the same signal S; one has the noise N, the other, averaged over ``count`` points, N / count.
+    Solved for S this holds at a wrong pose too. A map of one cloud tells nothing about N: then it is what the
+    gradients of both, with their independent noise, have in common.
+    """
+    of_map, of_live, common = texture[:6, :6], texture[6:12, 6:12], texture[:6, 6:12]
+    if count < 2.0:
+        both: Array = 0.5 * (common + common.T)
+        return both
+    signal: Array = (of_map - of_live / count) / (1.0 - 1.0 / count)
+    return signal
 
 
 def _any_normal(tilted: Array) -> Array:
@@ -201,7 +213,7 @@ def _rows(  # type: ignore[no-untyped-def]
     tilt_scale = f(normal_sigma)
     rows, columns = live.shape[0], live.shape[1]
     visible = used = texture_used = settled = 0
-    squares = weights = texture_squares = texture_weights = of_map = of_both = 0.0
+    squares = weights = texture_squares = texture_weights = of_map = of_both = inverse_counts = 0.0
     for i in range(chosen.size):
         m = map_rows[chosen[i]]
         x = r00 * m[0] + r01 * m[1] + r02 * m[2] + tx
@@ -268,6 +280,7 @@ def _rows(  # type: ignore[no-untyped-def]
         squared = difference * difference * q[12]
         if not squared < one:
             continue
+        inverse_counts += one / count
         if count >= f(SETTLED):
             of_map += m[9] * m[9]
             of_both += m[9] * texture
@@ -291,5 +304,5 @@ def _rows(  # type: ignore[no-untyped-def]
         textured[11, texture_used] = sx * hy - sy * hx
         textured[12, texture_used] = -w * difference
         texture_used += 1
-    sums = (squares, weights, texture_squares, texture_weights, of_map, of_both)
+    sums = (squares, weights, texture_squares, texture_weights, of_map, of_both, inverse_counts)
     return (visible, used, texture_used, settled), sums
