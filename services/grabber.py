@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections import deque
+import time
+from collections import Counter, deque
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import ClassVar
@@ -20,6 +21,8 @@ from endo3d.services.runtime.service import Exhausted, Source
 from endo3d_core.calibration import Rig
 
 TURN_S = 0.004
+REOPEN_NS = 1_000_000_000
+"""How often a camera that is gone is looked for."""
 HELD = 2
 """Shots that wait for their mode to be announced."""
 
@@ -47,6 +50,13 @@ class Grabber(Source[GrabberConfig]):
         self.held: deque[Shot] = deque()
         self.lent = 0
         self.announced = False
+        self.exposure_us: float | None = None
+        self.note = ""
+        self.gone = 0
+        """How often the camera was lost."""
+        self.look_ns = 0
+        self.lost_before: Mapping[str, int] = {}
+        """By cameras that are gone."""
 
     @property
     def camera(self) -> Camera:
@@ -57,29 +67,46 @@ class Grabber(Source[GrabberConfig]):
     def open(self) -> None:
         try:
             self.yaml = Path(self.config.head).read_text(encoding="utf-8")
-            self._camera = open_camera(self.config.camera, Setting(self.config.rig, self.yaml))
+            self.connect()
         except OSError as error:
-            raise UserError(
-                f"head {self.config.head!r}: {error.strerror}; name a file of deploy/heads"
-            ) from error
+            raise UserError(f"head {self.config.head!r}: {error.strerror}; name a file of deploy/heads") from error
         except (DeviceError, ValueError) as error:
             raise UserError(str(error)) from error
-        self.camera.arm()
+
+    def connect(self) -> None:
+        camera = open_camera(self.config.camera, Setting(self.config.rig, self.yaml))
+        try:
+            if self.exposure_us is not None:
+                camera.set_exposure(self.exposure_us)
+            camera.arm()
+        except DeviceError:
+            camera.close()
+            raise
+        self._camera, self.lent, self.note = camera, 0, ""
 
     def step(self, message: Message) -> Iterator[Message]:
         if isinstance(message, Mode):
             self.labels.add(message)
             if message.running:
-                self.camera.set_exposure(message.exposure_us)
+                self.exposure_us = message.exposure_us
+                if self._camera is not None:
+                    self._camera.set_exposure(message.exposure_us)
         yield from ()
 
     def poll(self, timeout_s: float) -> Iterator[Message]:
         if not self.announced:
             self.announced = True
             yield from self.calibration()
+        if self._camera is None:
+            self.look_for_camera(timeout_s)
+            return
         self.lend()
         # In short turns: a mode that is announced meanwhile must be known before its first shot is labelled.
-        shot = self.camera.wait(min(timeout_s, TURN_S))
+        try:
+            shot = self.camera.wait(min(timeout_s, TURN_S))
+        except DeviceError as error:
+            self.lose_camera(error)
+            return
         if shot is not None:
             self.lent -= 1
             self.held.append(shot)
@@ -88,6 +115,30 @@ class Grabber(Source[GrabberConfig]):
         if len(self.held) > HELD:
             self.held.popleft()
             self.labels.losses["shot:unlabelled"] += 1
+
+    def lose_camera(self, error: DeviceError) -> None:
+        """It was unplugged: say so, and look for it from now on."""
+        self.note = str(error)
+        self.gone += 1
+        self.lost_before = Counter(self.lost_before) + Counter(self.camera.losses())
+        self.camera.close()
+        self._camera = None
+
+    def look_for_camera(self, timeout_s: float) -> None:
+        if time.monotonic_ns() < self.look_ns:
+            time.sleep(timeout_s)
+            return
+        try:
+            self.connect()
+        except DeviceError as error:
+            self.note = str(error)
+        self.look_ns = time.monotonic_ns() + REOPEN_NS
+
+    def trouble(self) -> str:
+        return self.note
+
+    def values(self) -> Mapping[str, float]:
+        return {"camera_lost": float(self.gone)}
 
     def lend(self) -> None:
         """Keep the camera supplied; when the readers hold everything, the camera counts what it loses."""
@@ -108,9 +159,7 @@ class Grabber(Source[GrabberConfig]):
         )  # fmt: skip
         if isinstance(self.camera, Simulated):
             camera = self.camera
-            yield Truth(
-                stamp_ns, label.sequence, camera.T_scene_camera(stamp_ns), camera.scene, camera.slow_motion
-            )
+            yield Truth(stamp_ns, label.sequence, camera.T_scene_camera(stamp_ns), camera.scene, camera.slow_motion)
 
     def calibration(self) -> Iterator[Message]:
         """What the frames were taken with; the camera's lens as it is binned."""
@@ -129,7 +178,7 @@ class Grabber(Source[GrabberConfig]):
         )
 
     def losses(self) -> Mapping[str, int]:
-        of_camera = self._camera.losses() if self._camera else {}
+        of_camera = Counter(self.lost_before) + Counter(self._camera.losses() if self._camera else {})
         return {**self.labels.losses, **{f"camera:{cause}": count for cause, count in of_camera.items()}}
 
     def close(self) -> None:

@@ -19,6 +19,9 @@ from endo3d.services.runtime.service import Refused, Source
 from endo3d_core import patterns
 from endo3d_core.patterns import PatternSet
 
+LOOK_NS = 300_000_000
+"""How often the projector is asked how it does, and a lost one looked for."""
+
 
 class SequencerConfig(service.Config):
     projector: str = "sim:"
@@ -48,6 +51,10 @@ class Sequencer(Source[SequencerConfig]):
     def __init__(self, config: SequencerConfig) -> None:
         super().__init__(config)
         self._projector: Projector | None = None
+        self.note = ""
+        self.resumed = 0
+        """Starts after the projector had stopped by itself."""
+        self.look_ns = 0
 
     @property
     def projector(self) -> Projector:
@@ -61,15 +68,14 @@ class Sequencer(Source[SequencerConfig]):
             self.sets = {name: patterns.parse(text) for name, text in self.config.modes.items()}
             self._projector = open_projector(self.config.projector, Setting(self.config.rig, yaml))
         except OSError as error:
-            raise UserError(
-                f"head {self.config.head!r}: {error.strerror}; name a file of deploy/heads"
-            ) from error
+            raise UserError(f"head {self.config.head!r}: {error.strerror}; name a file of deploy/heads") from error
         except (DeviceError, ValueError) as error:
             raise UserError(str(error)) from error
         if self.config.mode not in self.sets:
             raise UserError(f"mode {self.config.mode!r} is none of sequencer.modes: {', '.join(self.sets)}")
         self.mode = self.config.mode
-        self.exposure_us = 1e6 / self.config.rate_hz - self.config.dark_us
+        # Projectors count whole microseconds.
+        self.exposure_us = float(round(1e6 / self.config.rate_hz - self.config.dark_us))
         # Seconds at the start, one more per start: a restarted sequencer doesn't repeat an epoch.
         self.epoch = self.projector.now_ns() // 1_000_000_000
         self.wanted = self.config.autostart
@@ -80,14 +86,36 @@ class Sequencer(Source[SequencerConfig]):
             raise UserError(str(error)) from error
 
     def poll(self, timeout_s: float) -> Iterator[Message]:
-        if self.wanted and (self.shown is None or not self.shown.running):
-            yield self.start()
+        if self.wanted and self.projector.now_ns() >= self.look_ns:
+            self.look_ns = self.projector.now_ns() + LOOK_NS
+            yield from self.tend()
         else:
             sleep(timeout_s)
 
-    def command(
-        self, verb: str, parameters: Mapping[str, Any], now_ns: int
-    ) -> Iterator[Message | Mapping[str, Any]]:
+    def tend(self) -> Iterator[Message]:
+        """Start what is wanted and doesn't run: at first, and after the projector was gone."""
+        if self.shown is not None and self.shown.running:
+            status = self.projector.status()
+            self.note = status.note
+            if status.running:
+                return
+            self.resumed += 1
+            yield self.say(self.projector.now_ns(), running=False)
+        try:
+            yield self.start()
+        except DeviceError as error:
+            self.note = str(error)
+        else:
+            self.note = ""
+
+    def trouble(self) -> str:
+        return self.note
+
+    def values(self) -> Mapping[str, float]:
+        return {"resumed": float(self.resumed)}
+
+    def command(self, verb: str, parameters: Mapping[str, Any], now_ns: int) -> Iterator[Message | Mapping[str, Any]]:
+        before = self.mode, self.exposure_us
         try:
             match verb:
                 case "mode":
@@ -108,6 +136,7 @@ class Sequencer(Source[SequencerConfig]):
             yield self.stop()
             mode = self.start()
         except (DeviceError, ValueError) as error:
+            self.mode, self.exposure_us = before  # which goes on as soon as the projector can
             raise Refused(str(error)) from error
         yield mode
         yield {
@@ -122,24 +151,20 @@ class Sequencer(Source[SequencerConfig]):
         try:
             pattern_set = patterns.parse(name)
         except ValueError as error:
-            raise ValueError(
-                f"{name!r} is no mode ({', '.join(self.sets)}) and no pattern set: {error}"
-            ) from error
+            raise ValueError(f"{name!r} is no mode ({', '.join(self.sets)}) and no pattern set: {error}") from error
         for known, loaded in self.sets.items():
             if loaded.text == pattern_set.text:
                 return known
         self.projector.stop()
+        self.projector.load([*self.sets.values(), pattern_set])
         self.sets[pattern_set.text] = pattern_set
-        self.projector.load(list(self.sets.values()))
         return pattern_set.text
 
     def exposure(self, value: object) -> float:
         """A wanted exposure, checked against the projector's limits."""
         shortest = self.projector.limits.min_exposure_us
         if not isinstance(value, int | float) or not value >= shortest:
-            raise ValueError(
-                f"exposure_us={value} is no exposure; the projector needs {shortest:g} us at least"
-            )
+            raise ValueError(f"exposure_us={value} is no exposure; the projector needs {shortest:g} us at least")
         return float(value)
 
     @property

@@ -34,23 +34,25 @@ class Place:
     """Bits per pixel."""
 
 
-def places(depths: Sequence[int]) -> list[Place]:
-    """Room for patterns of 1..8 bits, in order: three of 8 bits or 24 of one bit per image.
+def places(depths: Sequence[int], kinds: Sequence[object]) -> list[Place]:
+    """Room for patterns of 1..8 bits: three of 8 bits or 24 of one bit per image.
 
+    Patterns of different kinds share no image: columns among columns have equal lines, which compress well.
     Raises ``ValueError`` when the controller's memory does not hold them.
     """
     found: list[Place] = []
-    image, bit = 0, 0
-    for depth in depths:
+    open_images: dict[object, tuple[int, int]] = {}
+    images = 0
+    for depth, kind in zip(depths, kinds, strict=True):
+        image, bit = open_images.get(kind, (0, BITS))
         bit = -(-bit // depth) * depth  # aligned, so that 8-bit patterns are whole bytes
         if bit + depth > BITS:
-            image, bit = image + 1, 0
+            image, bit = images, 0
+            images += 1
         found.append(Place(image, bit, depth))
-        bit += depth
-    if found and found[-1].image >= IMAGES:
-        raise ValueError(
-            f"{len(depths)} patterns need {found[-1].image + 1} images of 24 bits; the projector holds {IMAGES}"
-        )
+        open_images[kind] = image, bit + depth
+    if images > IMAGES:
+        raise ValueError(f"{len(depths)} patterns need {images} images of 24 bits; the projector holds {IMAGES}")
     return found
 
 

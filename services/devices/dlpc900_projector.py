@@ -14,7 +14,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from itertools import groupby
 from typing import Any, TypeVar
 
 import numpy as np
@@ -98,8 +97,12 @@ class Dlpc900Projector:
         return Limits(float(self._connect().minimum_exposures_us[7]), MINIMUM_DARK_US)
 
     def load(self, sets: Sequence[PatternSet]) -> None:
-        self._sets = tuple(sets)
-        self._reaching(self._upload)
+        before, self._sets = self._sets, tuple(sets)
+        try:
+            self._reaching(self._upload)
+        except DeviceError:
+            self._sets = before
+            raise
 
     def start(self, pattern_set: PatternSet, exposure_us: float, dark_us: float) -> int:
         def start(controller: Controller) -> int:
@@ -159,9 +162,10 @@ class Dlpc900Projector:
         """Look-up table and images of all sets, in the order that the controller wants."""
         loaded = looks(self._sets, *self._window)
         try:
-            found = places([look.depth for look in loaded.looks])
+            found = places([look.depth for look in loaded.looks], [look.axis for look in loaded.looks])
         except ValueError as error:
             raise DeviceError(f"{error}; load fewer modes") from error
+        self._uploaded = False
         self._first, self._entries = {}, []
         for pattern_set, members in zip(self._sets, loaded.members, strict=True):
             self._first[pattern_set.text] = len(self._entries)
@@ -236,6 +240,7 @@ def _by_image_descending(
     found: Sequence[Place], loaded: Sequence[Look]
 ) -> list[tuple[int, list[tuple[Place, NDArray[np.uint8]]]]]:
     """Image index and its patterns, the last image first: the order in which they are uploaded."""
-    pairs = [(place, look.image) for place, look in zip(found, loaded, strict=True)]
-    by_image = [(index, list(group)) for index, group in groupby(pairs, key=lambda pair: pair[0].image)]
-    return by_image[::-1]
+    by_image: dict[int, list[tuple[Place, NDArray[np.uint8]]]] = {}
+    for place, look in zip(found, loaded, strict=True):
+        by_image.setdefault(place.image, []).append((place, look.image))
+    return sorted(by_image.items(), reverse=True, key=lambda item: item[0])

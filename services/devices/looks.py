@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from endo3d_core import patterns
-from endo3d_core.patterns import Pattern, PatternSet
+from endo3d_core.patterns import Axis, Pattern, PatternSet
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -20,6 +20,7 @@ class Look:
     """(height, width), below 2^depth."""
     depth: int
     """Bits: 1 for a binary wave, else 8."""
+    axis: Axis
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +43,7 @@ def looks(sets: Sequence[PatternSet], width: int, height: int) -> Looks:
                 distinct[bare] = len(found)
                 image = patterns.image(pattern, width, height)
                 binary = pattern.wave == "binary"
-                found.append(Look(image // np.uint8(255), 1) if binary else Look(image, 8))
+                found.append(Look(image // np.uint8(255) if binary else image, 1 if binary else 8, pattern.axis))
             of_set.append(distinct[bare])
         members.append(tuple(of_set))
     return Looks(tuple(found), tuple(members))

@@ -102,6 +102,12 @@ class _Stream:
     def pixel(self) -> int:
         return self.byte() << 16 | self.byte() << 8 | self.byte()
 
+    def pixels(self, count: int) -> NDArray[np.uint32]:
+        start, self.at = self.at, self.at + 3 * count
+        if self.at > len(self.body):
+            raise BadImage("the compressed image ends in the middle", BMP_COMPRESSION)
+        return _words(self.body[start : self.at])
+
 
 def _expand_rle(body: bytes, width: int, pixels: int, *, enhanced: bool) -> NDArray[np.uint32]:
     """Runs, literals, line copies and ends of line until the end-of-image mark."""
@@ -125,7 +131,7 @@ def _expand_rle(body: bytes, width: int, pixels: int, *, enhanced: bool) -> NDAr
     return out[:filled]
 
 
-def _commands(stream: _Stream, enhanced: bool) -> Iterator[tuple[str, int, int | list[int]]]:
+def _commands(stream: _Stream, enhanced: bool) -> Iterator[tuple[str, int, int | NDArray[np.uint32]]]:
     while True:
         repeat = stream.count() if enhanced else stream.byte()
         if repeat:
@@ -142,4 +148,4 @@ def _commands(stream: _Stream, enhanced: bool) -> Iterator[tuple[str, int, int |
                 raise BadImage("plain RLE knows no line copies", BMP_COMPRESSION)
             yield "previous line", copied, 0
         else:
-            yield "literal", control, [stream.pixel() for _ in range(control)]
+            yield "literal", control, stream.pixels(control)
