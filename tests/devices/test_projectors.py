@@ -109,7 +109,7 @@ class TestEveryProjector:
         self, projector: Projector, bench: Bench, exposure_us: float, dark_us: float
     ) -> None:
         projector.load([INTERLEAVED])
-        with pytest.raises(DeviceError, match="4046|105"):
+        with pytest.raises(DeviceError, match=r"4046|105"):
             projector.start(INTERLEAVED, exposure_us, dark_us)
         assert bench.read() == Shown() or not bench.read().running
 
