@@ -51,7 +51,5 @@ def write_depth_maps(maps: Iterable[DepthMap], folder: str | Path, kind: str = "
 
 def depth_mm(depth_map: DepthMap) -> NDArray[np.float32]:
     """(height, width) float32 z in mm, NaN where nothing was measured."""
-    z_mm = np.float32(depth_map.offset_mm) + np.float32(depth_map.scale_mm) * depth_map.depth.astype(
-        np.float32
-    )
+    z_mm = np.float32(depth_map.offset_mm) + np.float32(depth_map.scale_mm) * depth_map.depth.astype(np.float32)
     return np.where(depth_map.depth > 0, z_mm, np.float32(np.nan))

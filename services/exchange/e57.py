@@ -29,8 +29,6 @@ def write_e57(points: NDArray[Any], path: str | Path) -> int:
         columns["intensity"] = rows["intensity"].astype(np.float64)
     Path(path).unlink(missing_ok=True)
     file = pye57.E57(str(path), mode="w")
-    file.write_scan_raw(
-        {name: np.ascontiguousarray(column) for name, column in columns.items()}, name="endo3d"
-    )
+    file.write_scan_raw({name: np.ascontiguousarray(column) for name, column in columns.items()}, name="endo3d")
     file.close()
     return len(rows)

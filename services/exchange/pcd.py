@@ -32,9 +32,7 @@ def write_pcd(points: NDArray[Any], path: str | Path) -> int:
         "POINTS": str(len(rows)),
         "DATA": "binary",
     }
-    text = "# .PCD v0.7 - endo3d, lengths in mm\n" + "".join(
-        f"{key} {value}\n" for key, value in header.items()
-    )
+    text = "# .PCD v0.7 - endo3d, lengths in mm\n" + "".join(f"{key} {value}\n" for key, value in header.items())
     with Path(path).open("wb") as file:
         file.write(text.encode())
         file.write(packed.tobytes())

@@ -27,9 +27,7 @@ QOS = """\
 """
 
 
-def write_ros2_bag(
-    messages: Iterable[Message], folder: str | Path, *, namespace: str = "endo3d"
-) -> Counter[str]:
+def write_ros2_bag(messages: Iterable[Message], folder: str | Path, *, namespace: str = "endo3d") -> Counter[str]:
     """Writes images, depth, clouds, odometry, transforms, camera info and, at the end, the merged map.
 
     Returns the messages per topic. Raises ``UserError`` if the folder exists.

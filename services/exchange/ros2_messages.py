@@ -138,9 +138,7 @@ def cloud(message: m.Cloud | m.MapDelta, points: NDArray[Any]) -> dict[str, Any]
         "header": header(message.stamp_ns, message.frame_id),
         "height": height,
         "width": width,
-        "fields": [
-            {"name": name, "offset": 4 * k, "datatype": FLOAT32, "count": 1} for k, name in enumerate(names)
-        ],
+        "fields": [{"name": name, "offset": 4 * k, "datatype": FLOAT32, "count": 1} for k, name in enumerate(names)],
         "is_bigendian": False,
         "point_step": metric.itemsize,
         "row_step": width * metric.itemsize,

@@ -33,9 +33,7 @@ class _Writer:
 class Ros2Session:
     """Publishes on ROS topics; each exists from the first message on."""
 
-    def __init__(
-        self, router: str, *, domain: int = 0, node: str = "endo3d", namespace: str = "endo3d"
-    ) -> None:
+    def __init__(self, router: str, *, domain: int = 0, node: str = "endo3d", namespace: str = "endo3d") -> None:
         """router: endpoint such as ``tcp/127.0.0.1:7447``. Raises ``UserError`` when it doesn't answer."""
         self._domain, self._node, self._namespace = domain, node, namespace
         config = zenoh.Config()
@@ -45,9 +43,7 @@ class Ros2Session:
         try:
             self._session = zenoh.open(config)
         except zenoh.ZError as error:
-            raise UserError(
-                f"no ROS 2 router at {router}; start one: ros2 run rmw_zenoh_cpp rmw_zenohd"
-            ) from error
+            raise UserError(f"no ROS 2 router at {router}; start one: ros2 run rmw_zenoh_cpp rmw_zenohd") from error
         self._zid = str(self._session.info.zid())
         node_token = liveliness_key(domain, self._zid, NODE_ENTITY, "NN", node)
         self._node_token = self._session.liveliness().declare_token(node_token)
@@ -90,9 +86,7 @@ def dds_name(kind: str) -> str:
     return f"{package}::{folder}::dds_::{name}_"
 
 
-def liveliness_key(
-    domain: int, zid: str, entity: int, what: str, node: str, name: str = "", kind: str = ""
-) -> str:
+def liveliness_key(domain: int, zid: str, entity: int, what: str, node: str, name: str = "", kind: str = "") -> str:
     """What tells the ROS graph of a node (``NN``), or of a publisher (``MP``) of topic ``name``."""
     key = f"@ros2_lv/{domain}/{zid}/{NODE_ENTITY}/{entity}/{what}/%/%/{node}"
     if what == "NN":

@@ -21,8 +21,7 @@ DEFINITIONS = {
     "sensor_msgs/msg/PointCloud2": "std_msgs/Header header; uint32 height; uint32 width;"
     "sensor_msgs/PointField[] fields; bool is_bigendian; uint32 point_step; uint32 row_step; uint8[] data;"
     "bool is_dense",
-    "sensor_msgs/msg/RegionOfInterest": "uint32 x_offset; uint32 y_offset; uint32 height; uint32 width;"
-    "bool do_rectify",
+    "sensor_msgs/msg/RegionOfInterest": "uint32 x_offset; uint32 y_offset; uint32 height; uint32 width;bool do_rectify",
     "sensor_msgs/msg/CameraInfo": "std_msgs/Header header; uint32 height; uint32 width;"
     "string distortion_model; float64[] d; float64[9] k; float64[9] r; float64[12] p; uint32 binning_x;"
     "uint32 binning_y; sensor_msgs/RegionOfInterest roi",

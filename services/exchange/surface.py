@@ -54,15 +54,13 @@ def write_surface(
     if method == "poisson":
         extent = float(np.ptp(positions, axis=0).max())
         depth = min(12, max(6, math.ceil(math.log2(1.1 * extent / spacing_mm))))
-        meshes.generate_surface_reconstruction_screened_poisson(depth=depth, preclean=True)
+        meshes.generate_surface_reconstruction_screened_poisson(depth=depth, preclean=True, threads=1)
     else:
         meshes.generate_surface_reconstruction_ball_pivoting(ballradius=pymeshlab.PureValue(2.0 * spacing_mm))
     mesh = meshes.current_mesh()
     vertices, faces = _near(mesh.vertex_matrix(), mesh.face_matrix(), positions, FAR_SPACINGS * spacing_mm)
     if not len(faces):
-        raise UserError(
-            "no surface found in these points: try the other method, or a coarser merging distance"
-        )
+        raise UserError("no surface found in these points: try the other method, or a coarser merging distance")
     trimmed = pymeshlab.MeshSet(verbose=False)
     trimmed.add_mesh(pymeshlab.Mesh(vertex_matrix=vertices, face_matrix=faces))
     trimmed.save_current_mesh(str(target))

@@ -57,9 +57,7 @@ def test_tum_is_in_seconds_and_metres(tmp_path: Path) -> None:
     for k, line in enumerate(lines):
         np.testing.assert_allclose([float(v) for v in line[1:4]], 1e-3 * pose_of(k)[:3, 3], atol=1e-9)
         half = np.deg2rad(0.25 * k)
-        np.testing.assert_allclose(
-            [float(v) for v in line[4:]], [0, np.sin(half), 0, np.cos(half)], atol=1e-8
-        )
+        np.testing.assert_allclose([float(v) for v in line[4:]], [0, np.sin(half), 0, np.cos(half)], atol=1e-8)
 
 
 def test_csv_is_in_mm_with_uncertainty(tmp_path: Path) -> None:

@@ -5,30 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import pytest
 from rerun.chunk import McapReader
 from scans import K, messages, pose_of
 
-from endo3d.schemas import codec, topics
 from endo3d.schemas.messages import Cloud, Frame, MapDelta
-from endo3d.services.archive.entry import Entry
-from endo3d.services.archive.recording import Recording
-from endo3d.services.archive.writer import Kind
 from endo3d.services.views.colour import TABLES, packed
-
-
-@pytest.fixture(scope="module")
-def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("logs") / "scan.mcap"
-    recording = Recording(path, {})
-    for sequence, message in enumerate(messages(4)):
-        topic = topics.of(message)
-        kind = Kind(*codec.schema(topic))
-        channel = topic.channel(getattr(message, "service", ""))
-        payload = (codec.encode(message),)
-        recording.put(Entry(channel, kind, sequence, message.stamp_ns, message.stamp_ns, payload))
-    recording.finish()
-    return path
 
 
 def column(log: Path, entity: str, name: str) -> list[object]:
@@ -84,6 +65,4 @@ def test_calibration_is_a_pinhole(log: Path) -> None:
 
 
 def test_words_are_a_text_log(log: Path) -> None:
-    assert [text for (text,) in column(log, "/log/decoder", "TextLog:text")] == [
-        f"frame {k}" for k in range(4)
-    ]
+    assert [text for (text,) in column(log, "/log/decoder", "TextLog:text")] == [f"frame {k}" for k in range(4)]

@@ -28,9 +28,7 @@ def as_rosbags(name: str, values: dict[str, Any]) -> Any:
         value = values[field.name]
         if field.type in ros2_types.DEFINITIONS:
             one = field.count is None
-            made[field.name] = (
-                as_rosbags(field.type, value) if one else [as_rosbags(field.type, v) for v in value]
-            )
+            made[field.name] = as_rosbags(field.type, value) if one else [as_rosbags(field.type, v) for v in value]
         elif field.count is not None:
             made[field.name] = np.asarray(value, ros2_types.PRIMITIVES[field.type][0])
         else:
@@ -50,9 +48,7 @@ def test_type_hashes_and_members_are_those_of_ros(name: str) -> None:
     assert ros2_types.type_hash(name) == store.hash_rihs01(name)
     ours = [field.name for field in ros2_types.fields(name)]
     assert ours == [
-        field.name
-        for field in members(store.types[name])
-        if field.name.islower() and field.name != "__msgtype__"
+        field.name for field in members(store.types[name]) if field.name.islower() and field.name != "__msgtype__"
     ]
 
 
@@ -84,16 +80,12 @@ def test_odometry_turns_the_covariance_into_the_world() -> None:
     C = read.pose.covariance.reshape(6, 6)
     in_camera = np.diag([4e-12, 9e-12, 25e-12])
     np.testing.assert_allclose(C[:3, :3], T[:3, :3] @ in_camera @ T[:3, :3].T, rtol=1e-6, atol=1e-18)
-    np.testing.assert_allclose(
-        C[3:, 3:], T[:3, :3] @ np.diag([1e-8, 4e-8, 16e-8]) @ T[:3, :3].T, rtol=1e-6, atol=1e-14
-    )
+    np.testing.assert_allclose(C[3:, 3:], T[:3, :3] @ np.diag([1e-8, 4e-8, 16e-8]) @ T[:3, :3].T, rtol=1e-6, atol=1e-14)
 
 
 def test_a_lost_pose_is_not_odometry() -> None:
     pose = next(message for message in messages(1) if isinstance(message, m.Pose))
-    lost = m.Pose(
-        pose.stamp_ns, 0, pose.T_world_camera, pose.information, m.Tracking.LOST, 0, np.eye(6)[0], 0, 0, 0
-    )
+    lost = m.Pose(pose.stamp_ns, 0, pose.T_world_camera, pose.information, m.Tracking.LOST, 0, np.eye(6)[0], 0, 0, 0)
     assert list(Translator().of(lost)) == []
 
 
@@ -102,13 +94,7 @@ def test_rosbags_reads_the_bag(tmp_path: Path) -> None:
     with AnyReader([tmp_path / "bag"]) as bag:
         seen = {name: info.msgcount for name, info in bag.topics.items()}
         assert seen == dict(counts)
-        assert (
-            seen["/endo3d/image_raw"]
-            == seen["/endo3d/camera_info"]
-            == seen["/endo3d/odometry"]
-            == seen["/tf"]
-            == 5
-        )
+        assert seen["/endo3d/image_raw"] == seen["/endo3d/camera_info"] == seen["/endo3d/odometry"] == seen["/tf"] == 5
         assert bag.start_time == START_NS
         last = {}
         for connection, stamp_ns, raw in bag.messages():
