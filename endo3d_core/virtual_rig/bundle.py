@@ -18,8 +18,10 @@ from scipy.special import ndtr
 
 from endo3d_core.compiled import kernel
 
-JITTER = 0.07
-"""Standard deviation of a core's position, of the pitch, per axis."""
+JITTER = 0.05
+"""Standard deviation of a core's position in the lattice, of the pitch, per axis."""
+STRAIN, STRAIN_PITCHES, STRAIN_WAVES = 0.025, 25.0, 24
+"""The lattice is drawn, not grown: its pitch varies slowly, by so much (rms), with that wavelength."""
 CORE_WIDTH = 0.7
 """Diameter of a core, of the pitch."""
 GAIN_SIGMA = 0.12
@@ -106,9 +108,20 @@ def _lattice(
     c, s = math.cos(0.21), math.sin(0.21)
     cores = np.stack((c * u - s * v, s * u + c * v), axis=-1).reshape(-1, 2)
     cores = cores[np.hypot(*cores.T) <= circle_px / 2]
+    cores += _drawn(cores / pitch_px, rng) * pitch_px
     cores += rng.normal(0.0, JITTER * pitch_px, cores.shape)
     cores = cores[np.lexsort((cores[:, 0], np.floor(cores[:, 1] / (8 * pitch_px))))]
     return np.asarray(cores + np.array(((width - 1) / 2, (height - 1) / 2)))
+
+
+def _drawn(at: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.float64]:
+    """(n, 2) displacement of lattice points, all in pitches: random waves of the given rms strain."""
+    direction = rng.uniform(0.0, 2 * math.pi, STRAIN_WAVES)
+    k = 2 * math.pi / STRAIN_PITCHES * rng.uniform(0.6, 1.4, STRAIN_WAVES)
+    phase = at @ (k * np.stack((np.cos(direction), np.sin(direction))))
+    phase += rng.uniform(0.0, 2 * math.pi, STRAIN_WAVES)
+    size = STRAIN * math.sqrt(2.0 / STRAIN_WAVES) / k * rng.choice((-1.0, 1.0), (2, STRAIN_WAVES))
+    return np.asarray(np.sin(phase) @ size.T)
 
 
 def _face(cores: NDArray[np.float64], width: int, height: int, radius_px: float) -> Sparse:
