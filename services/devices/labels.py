@@ -54,7 +54,8 @@ class Labels:
         self.losses["beat:taken anew"] += run.clock.reanchored - reanchored
         self.losses["shot:off beat"] += placed.slot == UNKNOWN
         self.losses["trigger:missed"] += placed.missed
-        self._sequence += placed.missed + 1
+        # A grabber that was restarted goes on at the pattern that is shown: no (epoch, sequence) comes twice.
+        self._sequence = self._sequence + placed.missed + 1 if self._sequence >= 0 else max(0, placed.count)
         return Label(self._sequence, placed.slot, run.mode.epoch, run.mode.pattern_set)
 
     def _covering(self, trigger_ns: int) -> _Run | None:
