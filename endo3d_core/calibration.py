@@ -57,9 +57,7 @@ class Lens:
         object.__setattr__(self, "dist", np.ascontiguousarray(self.dist, np.float64).reshape(5))
         if self.width < 1 or self.height < 1:
             raise ValueError(f"a lens needs a positive width and height, not {self.width} x {self.height}")
-        if not (
-            self.K[0, 0] > 0 and self.K[1, 1] > 0 and np.all(self.K[2] == (0, 0, 1)) and self.K[1, 0] == 0
-        ):
+        if not (self.K[0, 0] > 0 and self.K[1, 1] > 0 and np.all(self.K[2] == (0, 0, 1)) and self.K[1, 0] == 0):
             raise ValueError("K must be [[fx, skew, cx], [0, fy, cy], [0, 0, 1]] with positive fx and fy")
 
     def project(self, points: ArrayLike) -> NDArray[np.float64]:
@@ -173,9 +171,7 @@ def _lens(section: Any, name: str) -> Lens:
     if missing:
         raise ValueError(f"the calibration's {name} has no {missing[0]!r}; it needs {', '.join(required)}")
     K = _numbers(section["K"], 9, f"{name}.K").reshape(3, 3)
-    return Lens(
-        int(section["width"]), int(section["height"]), K, _numbers(section["dist"], 5, f"{name}.dist")
-    )
+    return Lens(int(section["width"]), int(section["height"]), K, _numbers(section["dist"], 5, f"{name}.dist"))
 
 
 def _numbers(value: Any, count: int, name: str) -> NDArray[np.float64]:

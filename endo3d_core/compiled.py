@@ -1,9 +1,27 @@
-"""How the hot loops are compiled: the one place that says so."""
+"""How the hot loops are compiled: the one place that says so.
+
+Loops stay vectorised if every array element is read before a conditional expression chooses
+(``v = a[x]; out[x] = v if good else zero``: a load inside the choice makes the loop scalar, five times slower),
+if rows of one scratch array never alias within a loop, and if constants are float32.
+"""
 
 from __future__ import annotations
 
+import os
+import sys
 from collections.abc import Callable
 from typing import Any, TypeVar, cast
+
+import llvmlite.binding as llvm
+
+if "numba" not in sys.modules and "NUMBA_CPU_FEATURES" not in os.environ:
+    # LLVM prefers 256-bit code on Intel's AVX-512 cores, for the sake of old ones; these loops gain up to
+    half # from the full width. Read once at numba's import, so it has to be said before. Nothing is forced
+    that the # CPU doesn't report: this only takes back a preference.
+    _features = llvm.get_host_cpu_features()
+    if _features.get("avx512f"):
+        os.environ["NUMBA_CPU_NAME"] = llvm.get_host_cpu_name()
+        os.environ["NUMBA_CPU_FEATURES"] = _features.flatten() + ",-prefer-256-bit"
 
 import numba
 

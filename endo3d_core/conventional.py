@@ -64,9 +64,7 @@ def phase_weights(weights: NDArray[np.float64], frequencies: tuple[float, ...]) 
 
 
 @kernel
-def _demodulate_row(
-    fused: NDArray[np.float32], weights: NDArray[np.float32], out: NDArray[np.float32]
-) -> None:
+def _demodulate_row(fused: NDArray[np.float32], weights: NDArray[np.float32], out: NDArray[np.float32]) -> None:
     """fused (patterns, width) -> out (components, width); both pattern counts are multiples of four."""
     for c in range(out.shape[0]):
         row = out[c]
@@ -131,13 +129,14 @@ def unwrap_row(
             residual[x] = max(residual[x], check * (off + off))
             phase[x] = value + check * TWO_PI * order
         known = rung
-    background, c1, s1 = components[0], components[1], components[2]
+    background, c1, s1, share0 = components[0], components[1], components[2], phase_weight[0]
     for x in range(phase.size):
         b = np.sqrt(c1[x] * c1[x] + s1[x] * s1[x])
         contrast[x] = b / max(background[x], darkest)
         trusted = (contrast[x] > least) & (background[x] > darkest) & (residual[x] < np.float32(0.8))
-        fine[x] = phase[x]
-        phase[x] = phase[x] * phase_weight[0] if trusted else nan
+        e = phase[x]
+        fine[x] = e
+        phase[x] = e * share0 if trusted else nan
     for i in range(1, frequencies.size):
         share, w, gain = frequencies[i] / f1, wrapped[i], phase_weight[i] * f1 / frequencies[i]
         for x in range(phase.size):
@@ -173,7 +172,8 @@ def _decode(
     scale, low, high = np.float32(px_per_rad), np.float32(z_min), np.float32(z_max)
     rad_per_px, one, zero = np.float32(1.0) / scale, np.float32(1.0), np.float32(0.0)
     exposed, brightest, carrier, phase = scratch[0], scratch[1], scratch[2], scratch[3]
-    residual, contrast, intensity, sigma = scratch[4], scratch[5], scratch[6], scratch[7]
+    residual, contrast, intensity, spread = scratch[4], scratch[5], scratch[6], scratch[7]
+    shortest = exposures[0]
     count = 0
     for v in range(frames.shape[1]):
         fuse_row(frames, v, exposures, saturation, fused, exposed, brightest)
@@ -189,11 +189,12 @@ def _decode(
         for x in range(phase.size):
             power = c1[x] * c1[x] + s1[x] * s1[x]
             variance = noise[0] * (noise[1] * background[x] + noise[2])
-            sigma[x] = np.sqrt(variance / max(power, np.float32(1e-6)))
+            spread[x] = variance / max(power, np.float32(1e-6))
             # Grey values per unit of the shortest exposure, whatever was fused.
-            intensity[x] = background[x] * exposures[0] / exposed[x] if exposed[x] > zero else zero
+            grey, time = background[x] * shortest, exposed[x]
+            intensity[x] = grey / max(time, shortest)
             residual[x] = min(contrast[x], one) * max(one - residual[x], zero)
-        count += triangulation.write_row(row, scale, low, high, phase, intensity, residual, sigma, points[v])
+        count += triangulation.write_row(row, scale, low, high, phase, intensity, residual, spread, points[v])
     return count
 
 
@@ -231,9 +232,7 @@ class Conventional:
         self._beat_with = np.array([i for i, _ in chain], np.int64)
         self._beats = np.array([beat for _, beat in chain], np.float32)
         self._phase_weight = phase_weights(weights, self.frequencies).astype(np.float32)
-        per_phase = np.array(
-            [np.sum(weights[1 + 2 * i : 3 + 2 * i] ** 2) / 2 for i in range(len(self.frequencies))]
-        )
+        per_phase = np.array([np.sum(weights[1 + 2 * i : 3 + 2 * i] ** 2) / 2 for i in range(len(self.frequencies))])
         gain = np.sum((self._phase_weight * self.frequencies[0] / self._frequencies) ** 2 * per_phase)
         self._noise = np.array((gain, *sensor.variance(bin_px)), np.float32)
         padded = 4 * -(-len(once) // 4)
@@ -245,7 +244,7 @@ class Conventional:
         self._fused = np.zeros((padded, lookup.width), np.float32)
         self._components = np.zeros((weights.shape[0], lookup.width), np.float32)
         self._wrapped = np.zeros((len(self.frequencies), lookup.width), np.float32)
-        self._row = np.zeros((7, lookup.width), np.float32)
+        self._row = np.zeros((triangulation.ROW_PLANES, lookup.width), np.float32)
         self._scratch = np.zeros((8, lookup.width), np.float32)
         self.count = 0
 

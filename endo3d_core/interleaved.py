@@ -19,7 +19,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from endo3d_core import bandpass, triangulation, uncertainty, unwrap
+from endo3d_core import bandpass, triangulation, uncertainty, unwrap, windowed_fit
 from endo3d_core.binning import Image, bin_image
 from endo3d_core.compiled import kernel
 from endo3d_core.patterns import PatternSet
@@ -57,7 +57,8 @@ def _filter_reuse(
         for x in range(width):
             twice = g[x] + g[x]
             total = b[x] + twice + a[x]
-            n[x] = s * (twice / total - half) if total > least else zero
+            value = s * (twice / total - half)
+            n[x] = value if total > least else zero
             inner[x] = n[x]
         bandpass.filter_row(padded, cosine, sine, phasor[0, v], phasor[1, v])
 
@@ -82,7 +83,9 @@ def _filter_difference(
         p, m, a, n = plus[v], minus[v], background[v], signal[v]
         inner = padded[taps : taps + width]
         for x in range(width):
-            n[x] = s * (p[x] - m[x]) / a[x] if a[x] > least else zero
+            mean = a[x]
+            value = s * (p[x] - m[x]) / mean
+            n[x] = value if mean > least else zero
             inner[x] = n[x]
         bandpass.filter_row(padded, cosine, sine, phasor[0, v], phasor[1, v])
 
@@ -118,6 +121,7 @@ class Interleaved:
         bin_px: int,
         *,
         form: Form = "reuse",
+        fit: bool = True,
         dark_grey: float = 2.0,
         modulation_min: float = unwrap.MODULATION_MIN,
         sensor: uncertainty.Sensor = uncertainty.IMX174,
@@ -125,14 +129,12 @@ class Interleaved:
         if pattern_set.kind != "interleaved" or form not in FRAMES:
             raise ValueError(f"no {form!r} decoding of {pattern_set.text!r}")
         self.f1, self.f2 = pattern_set.frequencies
-        self.lookup, self.form, self.bin_px = lookup, form, bin_px
+        self.lookup, self.form, self.fit, self.bin_px = lookup, form, fit, bin_px
         self.frames = FRAMES[form]
         self.latency = self.frames // 2
         self.dark_grey, self.modulation_min = dark_grey, modulation_min
         self.rad_per_px = 2.0 * math.pi * self.f1 / lookup.period_px
-        self.filters = [
-            bandpass.gabor(lookup.period_px / (f * lookup.centre_slope)) for f in (self.f1, self.f2)
-        ]
+        self.filters = [bandpass.gabor(lookup.period_px / (f * lookup.centre_slope)) for f in (self.f1, self.f2)]
         self.count = 0
         self.slot = -1
         shape = (lookup.height, lookup.width)
@@ -143,11 +145,15 @@ class Interleaved:
         self._transposed = np.zeros(shape[::-1], np.float32)
         self._carrier = np.zeros(shape, np.float32)
         triangulation.carrier(lookup.planes, lookup.rows_per_node, self.rad_per_px, self._carrier)
-        self._raw_phase, self.phase = np.zeros((2, *shape), np.float32)
+        self._start, self._fitted, self.phase = np.zeros((3, *shape), np.float32)
         self.modulation, self.residual, self.intensity, self.quality = np.zeros((4, *shape), np.float32)
-        self.sigma_rad = np.zeros(shape, np.float32)
-        self._variance = sensor.variance(bin_px)
-        self._row = np.zeros((7, lookup.width), np.float32)
+        self.variance = np.zeros(shape, np.float32)
+        self._grey_variance = sensor.variance(bin_px)
+        self._quarter_px = max(1, round(abs(lookup.period_px / (self.f1 * lookup.centre_slope)) / 4))
+        self._fit_rows = np.zeros((5, lookup.width), np.float32)
+        self._fit_sums = np.zeros((3, 6, lookup.width), np.float32)
+        self._fit_padded = np.zeros((6, lookup.width + 2 * windowed_fit.HALF_COLUMNS), np.float32)
+        self._row = np.zeros((triangulation.ROW_PLANES, lookup.width), np.float32)
 
     def reset(self) -> None:
         """Forget the window: after a lost frame, a new epoch, a slipped slot."""
@@ -175,9 +181,6 @@ class Interleaved:
         """Triangulate the current result into out, the camera grid (height, width, 6); returns the valid
         count."""
         lookup = self.lookup
-        unwrap.grade(self.modulation, self.residual, self.quality)
-        gain = SIGNAL_NOISE * self.filters[0].noise_gain
-        uncertainty.bandpass_sigma(self.intensity, self.modulation, *self._variance, gain, self.sigma_rad)
         return triangulation.write_points(
             lookup.planes,
             lookup.rows_per_node,
@@ -187,7 +190,7 @@ class Interleaved:
             self.phase,
             self.intensity,
             self.quality,
-            self.sigma_rad,
+            self.variance,
             self._row,
             out if lookup.axis == "columns" else out.transpose(1, 0, 2),
         )
@@ -246,22 +249,51 @@ class Interleaved:
             self._filter_difference(self._grid(k + 1), self._grid(k - 1), self.slot - k - 1, 0.5, before)
             self._filter_difference(self._grid(k), self.intensity, self.slot - k, 1.0, centre)
             after = before
-        neighbours = (self.phasors[before], self.phasors[after])
-        alone = (self.phasors[centre], self.phasors[centre])
-        centre_is_f1 = _of_slot(self.slot - k)[0] == 0
-        first, second = (alone, neighbours) if centre_is_f1 else (neighbours, alone)
         unwrap.beat_unwrap(
-            *first,
-            *second,
+            *self._of_both(self.phasors, before, centre, after),
             self._carrier,
             self.f1,
             self.f2,
             self.modulation_min,
-            self._raw_phase,
+            self._start,
             self.modulation,
             self.residual,
         )
-        unwrap.keep_smooth(self._raw_phase, unwrap.NEIGHBOUR_MAX_RAD, self.phase)
+        if self.fit:
+            self._fit_window(before, centre, after)
+        else:
+            unwrap.grade(self.modulation, self.residual, self.quality)
+            gain = SIGNAL_NOISE * self.filters[0].noise_gain
+            uncertainty.bandpass_variance(self.intensity, self.modulation, *self._grey_variance, gain, self.variance)
+        unwrap.keep_smooth(self._fitted if self.fit else self._start, unwrap.NEIGHBOUR_MAX_RAD, self.phase)
+
+    def _of_both(
+        self, planes: NDArray[np.float32], before: int, centre: int, after: int
+    ) -> tuple[NDArray[np.float32], ...]:
+        """The two planes whose mean is f1's, and the two of f2's: the centre's alone, its neighbours'
+        averaged."""
+        alone, neighbours = (planes[centre], planes[centre]), (planes[before], planes[after])
+        centre_is_f1 = _of_slot(self.slot - self.latency)[0] == 0
+        return (*alone, *neighbours) if centre_is_f1 else (*neighbours, *alone)
+
+    def _fit_window(self, before: int, centre: int, after: int) -> None:
+        windowed_fit.fit(
+            self._start,
+            self._carrier,
+            *self._of_both(self.signals, before, centre, after),
+            self.f2 / self.f1,
+            self._quarter_px,
+            self.modulation,
+            self.intensity,
+            tuple(SIGNAL_NOISE**2 * v for v in self._grey_variance),
+            self.modulation_min,
+            self._fit_rows,
+            self._fit_sums,
+            self._fit_padded,
+            self._fitted,
+            self.variance,
+            self.quality,
+        )
 
 
 def _of_slot(slot: int) -> tuple[int, float]:

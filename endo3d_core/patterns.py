@@ -120,9 +120,7 @@ def conventional(
     if len(set(frequencies)) != len(frequencies) or min(frequencies) <= 0:
         raise ValueError("the frequencies of a conventional sequence must be positive and distinct")
     if steps[0] < 3 or min(steps) < 2:
-        raise ValueError(
-            "the first frequency needs three steps or more (it carries the background), the others two"
-        )
+        raise ValueError("the first frequency needs three steps or more (it carries the background), the others two")
     if not 3 <= sum(steps) <= 16:
         raise ValueError(f"a conventional sequence has at most 16 patterns, not {sum(steps)}")
     if any(exposure <= 0 for exposure in exposures_us):
@@ -231,9 +229,7 @@ def format_text(pattern_set: PatternSet) -> str:
     return " ".join(words)
 
 
-def _floats(
-    text: str, values: dict[str, str], key: str, default: tuple[float, ...] | None = None
-) -> tuple[float, ...]:
+def _floats(text: str, values: dict[str, str], key: str, default: tuple[float, ...] | None = None) -> tuple[float, ...]:
     if key not in values:
         if default is None:
             raise ValueError(f"pattern set {text!r} has no {key}=")
@@ -241,9 +237,7 @@ def _floats(
     try:
         numbers = tuple(float(number) for number in values[key].split("/"))
     except ValueError as error:
-        raise ValueError(
-            f"pattern set {text!r}: {key}={values[key]} is not a list of numbers like 50/49/43"
-        ) from error
+        raise ValueError(f"pattern set {text!r}: {key}={values[key]} is not a list of numbers like 50/49/43") from error
     if not all(math.isfinite(number) for number in numbers):
         raise ValueError(f"pattern set {text!r}: {key} must be finite")
     return numbers

@@ -23,6 +23,8 @@ NODES = 6
 
 CENTRE, C0, C1, C2, C3, RAY_X, RAY_Y = range(7)
 """Planes of ``Lookup.planes``."""
+ROW_PLANES = 9
+"""Of a row's scratch: the lookup's seven, depth and its sigma."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,9 +76,7 @@ def build(rig: Rig, bin_px: int, z_min_mm: float, z_max_mm: float, axis: Axis = 
     # Chebyshev nodes in 1/z: the least-squares cubic through them is near the minimax one.
     chebyshev = np.cos(np.pi * (np.arange(NODES) + 0.5) / NODES)
     inverse_z = inverse_range.mean() + 0.5 * np.ptp(inverse_range) * chebyshev
-    offset = (
-        np.stack([coded(rig.projector_pixel(rays / q), axis) for q in inverse_z], axis=-1) - centre[..., None]
-    )
+    offset = np.stack([coded(rig.projector_pixel(rays / q), axis) for q in inverse_z], axis=-1) - centre[..., None]
     scale = np.abs(offset).max()
     if not np.isfinite(scale):
         raise ValueError("the projector's lens model folds over inside the working volume")
@@ -99,7 +99,7 @@ def build(rig: Rig, bin_px: int, z_min_mm: float, z_max_mm: float, axis: Axis = 
 
 @kernel
 def interpolate_row(planes: NDArray[np.float32], position: float, row: NDArray[np.float32]) -> None:
-    """Planes (7, nodes, width) at a node position -> row (7, width)."""
+    """Planes (7, nodes, width) at a node position -> the first 7 of row (9, width)."""
     node = min(int(position), planes.shape[1] - 2)
     t = np.float32(position - node)
     for p in range(planes.shape[0]):
@@ -131,36 +131,38 @@ def write_row(
     residual: NDArray[np.float32],
     intensity: NDArray[np.float32],
     quality: NDArray[np.float32],
-    sigma_rad: NDArray[np.float32],
+    variance: NDArray[np.float32],
     points: NDArray[np.float32],
 ) -> int:
     """One row of phases relative to mid-depth, rad -> points (width, 6); returns the valid count.
 
     NaN phases and depths outside z_min..z_max become NaN points. ``row`` is the row's lookup from
-    ``interpolate_row``; its first two planes are overwritten.
+    ``interpolate_row``; its last two rows are scratch.
     """
     c0, c1, c2, c3, rx, ry = row[1], row[2], row[3], row[4], row[5], row[6]
-    z_row, s_row = row[0], row[1]
+    z_row, s_row = row[7], row[8]
     two, three, one = np.float32(2.0), np.float32(3.0), np.float32(1.0)
     zero, nan = np.float32(0.0), np.float32(np.nan)
-    count = 0
+    count = np.int32(0)
     for x in range(residual.size):
         d = residual[x] * px_per_rad
         z = one / (c0[x] + d * (c1[x] + d * (c2[x] + d * c3[x])))
         slope = z * z * (c1[x] + d * (two * c2[x] + d * three * c3[x])) * px_per_rad
+        sigma = np.sqrt(slope * slope * variance[x])
         inside = (z >= z_min) & (z <= z_max)
         z_row[x] = z if inside else nan
-        s_row[x] = abs(slope) * sigma_rad[x] if inside else nan
-        count += int(inside)
+        s_row[x] = sigma if inside else nan
     for x in range(residual.size):
-        z = z_row[x]
+        z, q = z_row[x], quality[x]
         points[x, 0] = rx[x] * z
         points[x, 1] = ry[x] * z
         points[x, 2] = z
         points[x, 3] = intensity[x]
-        points[x, 4] = quality[x] if z == z else zero
+        points[x, 4] = q if z == z else zero
         points[x, 5] = s_row[x]
-    return count
+    for x in range(residual.size):
+        count += np.int32(z_row[x] == z_row[x])
+    return int(count)
 
 
 @kernel
@@ -173,36 +175,28 @@ def write_points(
     residual: NDArray[np.float32],
     intensity: NDArray[np.float32],
     quality: NDArray[np.float32],
-    sigma_rad: NDArray[np.float32],
+    variance: NDArray[np.float32],
     row: NDArray[np.float32],
     points: NDArray[np.float32],
 ) -> int:
-    """``write_row`` over a grid (height, width); ``row`` is (7, width) scratch."""
+    """``write_row`` over a grid (height, width); ``row`` is scratch, ``ROW_PLANES`` by width."""
     scale, low, high = np.float32(px_per_rad), np.float32(z_min), np.float32(z_max)
     count = 0
     for v in range(residual.shape[0]):
         interpolate_row(planes, v / per_node, row)
-        count += write_row(
-            row, scale, low, high, residual[v], intensity[v], quality[v], sigma_rad[v], points[v]
-        )
+        count += write_row(row, scale, low, high, residual[v], intensity[v], quality[v], variance[v], points[v])
     return count
 
 
 @kernel
-def write_depth(
-    points: NDArray[np.float32], scale_mm: float, offset_mm: float, depth: NDArray[np.uint16]
-) -> None:
+def write_depth(points: NDArray[np.float32], scale_mm: float, offset_mm: float, depth: NDArray[np.uint16]) -> None:
     """points (height, width, 6) -> depth (height, width): z = offset + scale * value, 0 where invalid."""
     per_mm, offset, half = np.float32(1.0 / scale_mm), np.float32(offset_mm), np.float32(0.5)
     for v in range(depth.shape[0]):
         p, row = points[v], depth[v]
         for x in range(row.size):
             value = (p[x, 2] - offset) * per_mm + half
-            row[x] = (
-                np.uint16(value)
-                if (value >= np.float32(1.0)) & (value < np.float32(65535.0))
-                else np.uint16(0)
-            )
+            row[x] = np.uint16(value) if (value >= np.float32(1.0)) & (value < np.float32(65535.0)) else np.uint16(0)
 
 
 def exact_depth(

@@ -34,18 +34,19 @@ IMX174 = Sensor()
 
 
 @kernel
-def bandpass_sigma(
+def bandpass_variance(
     background: NDArray[np.float32],
     modulation: NDArray[np.float32],
     slope: float,
     offset: float,
     gain: float,
-    sigma_rad: NDArray[np.float32],
+    variance: NDArray[np.float32],
 ) -> None:
     """Phase noise of a filtered normalised signal, all (height, width): gain * sigma_g / (background *
     modulation)."""
-    a, b, g, tiny = np.float32(slope), np.float32(offset), np.float32(gain), np.float32(1e-6)
-    for v in range(sigma_rad.shape[0]):
-        mean, m, row = background[v], modulation[v], sigma_rad[v]
+    a, b, tiny = np.float32(slope * gain * gain), np.float32(offset * gain * gain), np.float32(1e-6)
+    for v in range(variance.shape[0]):
+        mean, m, row = background[v], modulation[v], variance[v]
         for x in range(row.size):
-            row[x] = g * np.sqrt(a * mean[x] + b) / max(mean[x] * m[x], tiny)
+            signal = max(mean[x] * m[x], tiny)
+            row[x] = (a * mean[x] + b) / (signal * signal)

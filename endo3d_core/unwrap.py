@@ -86,9 +86,7 @@ def keep_smooth(phase: NDArray[np.float32], limit_rad: float, out: NDArray[np.fl
 
 
 @kernel
-def grade(
-    modulation: NDArray[np.float32], residual: NDArray[np.float32], quality: NDArray[np.float32]
-) -> None:
+def grade(modulation: NDArray[np.float32], residual: NDArray[np.float32], quality: NDArray[np.float32]) -> None:
     """Quality 0..1: modulation against the ideal 1/2, less the beat's disagreement."""
     for v in range(quality.shape[0]):
         m, r, row = modulation[v], residual[v], quality[v]

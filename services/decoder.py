@@ -180,9 +180,7 @@ class Decoder(service.Service[DecoderConfig]):
         sensor = Sensor(FULL_WELL_ELECTRONS / full_grey, READ_NOISE_ELECTRONS)
         dark_grey = self.config.dark_grey * full_grey / 255.0
         if pattern_set.kind == "interleaved":
-            return Interleaved(
-                pattern_set, lookup, bin_px, form=self.config.form, dark_grey=dark_grey, sensor=sensor
-            )
+            return Interleaved(pattern_set, lookup, bin_px, form=self.config.form, dark_grey=dark_grey, sensor=sensor)
         return Conventional(pattern_set, lookup, bin_px, dtype.type, dark_grey=dark_grey, sensor=sensor)
 
     def _calibrate_from_messages(self) -> None:

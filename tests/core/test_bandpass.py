@@ -21,9 +21,7 @@ def test_a_cosine_becomes_its_phasor(period: float, sign: float) -> None:
     """Exact at the carrier, for phases that grow along the row and for phases that fall."""
     phase = sign * (2 * np.pi * np.arange(400) / period + 0.4)
     inner = slice(60, -60)
-    np.testing.assert_allclose(
-        filtered(np.cos(phase), sign * period)[inner], np.exp(1j * phase)[inner], atol=2e-6
-    )
+    np.testing.assert_allclose(filtered(np.cos(phase), sign * period)[inner], np.exp(1j * phase)[inner], atol=2e-6)
 
 
 def test_a_slow_background_hardly_passes() -> None:

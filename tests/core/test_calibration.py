@@ -26,9 +26,7 @@ def test_projection_is_opencvs() -> None:
 
 
 @given(k1=coefficient, k2=st.floats(-0.02, 0.02), p1=small, p2=small)
-def test_undistortion_inverts_distortion_over_the_whole_image(
-    k1: float, k2: float, p1: float, p2: float
-) -> None:
+def test_undistortion_inverts_distortion_over_the_whole_image(k1: float, k2: float, p1: float, p2: float) -> None:
     some = lens((k1, k2, p1, p2, 0.0))
     pixels = some.pixel_grid()[::150, ::160]
     np.testing.assert_allclose(some.project(17.0 * some.ray(pixels)), pixels, atol=1e-8)

@@ -17,9 +17,7 @@ def decode(form: Form, axial_um: float, *, texture: bool = False, noise: bool = 
     rig, rng = small_rig(), np.random.default_rng(rng_seed)
     decoder = Interleaved(SET, triangulation.build(rig, 2, 16.5, 23.5), 2, form=form)
     albedo = (
-        np.where(rng.random((600, 960)) > 0.5, 0.5, 1.0).repeat(24, 0).repeat(24, 1)[:600, :960]
-        if texture
-        else 1.0
+        np.where(rng.random((600, 960)) > 0.5, 0.5, 1.0).repeat(24, 0).repeat(24, 1)[:600, :960] if texture else 1.0
     )
     for k in range(8):
         surface = Plane(20.0 + axial_um * 1e-3 * k)

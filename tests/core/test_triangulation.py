@@ -21,7 +21,7 @@ def test_depth_is_within_a_tenth_of_a_micrometre_of_the_exact_one(name: str, bin
     truth = rng.uniform(z_min, z_max, grid.shape[:2])
     points = rig.camera.ray(grid) * truth[..., None]
     coordinate = triangulation.coded(rig.projector_pixel(points), "columns")
-    row = np.empty((7, lookup.width), np.float32)
+    row = np.empty((triangulation.ROW_PLANES, lookup.width), np.float32)
     out = np.empty((lookup.width, 6), np.float32)
     ones = np.ones(lookup.width, np.float32)
     for v in range(grid.shape[0]):
@@ -38,24 +38,22 @@ def test_exact_depth_inverts_projection() -> None:
     rig = head_rig()
     pixels = rig.camera.pixel_grid()[::200, ::200]
     truth = np.linspace(17.0, 23.0, pixels.shape[0] * pixels.shape[1]).reshape(pixels.shape[:2])
-    coordinate = triangulation.coded(
-        rig.projector_pixel(rig.camera.ray(pixels) * truth[..., None]), "columns"
-    )
+    coordinate = triangulation.coded(rig.projector_pixel(rig.camera.ray(pixels) * truth[..., None]), "columns")
     np.testing.assert_allclose(triangulation.exact_depth(rig, pixels, coordinate, 20.0), truth, atol=1e-9)
 
 
 def test_sigma_is_the_slope_times_the_phase_noise() -> None:
     """Two phases a little apart: their depths differ by what sigma says."""
     lookup = triangulation.build(head_rig(), 4, 16.5, 23.5)
-    row = np.empty((7, lookup.width), np.float32)
+    row = np.empty((triangulation.ROW_PLANES, lookup.width), np.float32)
     depths = []
     for phase in (0.5, 0.52):
         triangulation.interpolate_row(lookup.planes, 20.0, row)
         out = np.empty((lookup.width, 6), np.float32)
         flat = np.full(lookup.width, phase, np.float32)
-        ones, sigma = np.ones(lookup.width, np.float32), np.full(lookup.width, 0.02, np.float32)
+        ones, spread = np.ones(lookup.width, np.float32), np.full(lookup.width, 0.02**2, np.float32)
         scale, low, high = np.float32(6.1), np.float32(16.5), np.float32(23.5)
-        triangulation.write_row(row, scale, low, high, flat, ones, ones, sigma, out)
+        triangulation.write_row(row, scale, low, high, flat, ones, ones, spread, out)
         depths.append(out)
     np.testing.assert_allclose(np.abs(depths[1][:, 2] - depths[0][:, 2]), depths[0][:, 5], rtol=0.02)
 
