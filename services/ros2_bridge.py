@@ -45,6 +45,7 @@ class Ros2Bridge(Service[Ros2BridgeConfig]):
     )
     optional = reads
     newest = (topics.FRAME, topics.CLOUD, topics.DEPTH)
+    nice = 5
 
     def __init__(self, config: Ros2BridgeConfig) -> None:
         super().__init__(config)

@@ -56,6 +56,7 @@ class Viewer(Service[ViewerConfig]):
     )
     optional = reads
     newest = (topics.FRAME, topics.CLOUD, topics.DEPTH)
+    nice = 10
 
     def __init__(self, config: ViewerConfig) -> None:
         super().__init__(config)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import signal
 import sys
 import threading
@@ -38,6 +39,7 @@ def run(service: Service[Any], *, rig: str, name: str, port: int | None = None, 
     """
     logs.to_stderr()
     sys.setswitchinterval(_SWITCH_S)
+    os.nice(service.nice)
     with Bus.open(rig, name=name, port=port, shm_mb=shm_mb) as bus:
         runner = Runner(service, bus)
 

@@ -79,6 +79,9 @@ class Service(Generic[C]):
     commands: ClassVar[tuple[str, ...]] = ()
     """The verbs ``command`` understands."""
 
+    nice: ClassVar[int] = 0
+    """Its process yields the processor to the others by this much: for services that only look on."""
+
     def __init__(self, config: C) -> None:
         self.config = config
         self.loan: Loan = plain_loan
