@@ -16,8 +16,8 @@ import llvmlite.binding as llvm
 
 if "numba" not in sys.modules and "NUMBA_CPU_FEATURES" not in os.environ:
     # LLVM prefers 256-bit code on Intel's AVX-512 cores, for the sake of old ones; these loops gain up to
-    half # from the full width. Read once at numba's import, so it has to be said before. Nothing is forced
-    that the # CPU doesn't report: this only takes back a preference.
+    # half from the full width. Read once at numba's import, so it has to be said before. Nothing is forced that
+    # the CPU doesn't report: this only takes back a preference.
     _features = llvm.get_host_cpu_features()
     if _features.get("avx512f"):
         os.environ["NUMBA_CPU_NAME"] = llvm.get_host_cpu_name()

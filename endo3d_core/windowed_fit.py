@@ -9,9 +9,9 @@ in a window, u being the column relative to its centre. With b = a tan D this is
 
     s_f ~ a cos_f + (b + m u) (-rho_f sin_f),   cos_f, sin_f at rho_f (phi + e0),
 
-for any D where rho_f is one, nearly so for f2 = f1 - 1. One least-squares solution per pixel, its sums box-filtered over
-the image, therefore replaces the Gauss-Newton iterations, and its information is the point's sigma. Where one
-cosine has no slope the other has, but for two narrow beat zones where the neighbours help out.
+for any D where rho_f is one, nearly so for f2 = f1 - 1. One least-squares solution per pixel, its sums
+box-filtered over the image, therefore replaces the Gauss-Newton iterations, and its information is the point's
+sigma. Where one cosine has no slope the other has, but for two narrow beat zones where the neighbours help out.
 
 A slope down the window need not be solved for: the fringes run along it, so it hardly couples with D.
 """
@@ -27,20 +27,15 @@ from endo3d_core.phase import atan, cos_sin
 HALF_COLUMNS, HALF_ROWS = 2, 1
 """The window is 5 columns by 3 rows."""
 GAIN_PRIOR = 0.1
-"""Samples' worth of belief that the gain is the band-pass's modulation: only felt where nothing else
-tells."""
+"""Samples' worth of belief that the gain is the band-pass's modulation: only felt where nothing else tells."""
 SLOPE_PRIOR = 0.2
 """The same for a zero slope of the correction, in samples one column away."""
 DEGREES_OF_FREEDOM = 2 * 15 - 3
 
-_P, _N, _A, _R, _Q, _S = range(6)
-"""Rows of sums: sin^2, -sin cos, cos^2, -sin s, cos s, s^2, each over both frequencies."""
-
 
 @kernel
 def _smooth_base(phase: NDArray[np.float32], quarter_px: int, base: NDArray[np.float32]) -> None:
-    """One row of the band-pass's phase -> base: a comb (1 2 1)/4 a quarter fringe apart, which nulls its
-    ripple.
+    """One row of the band-pass's phase -> base: a comb (1 2 1)/4 a quarter fringe apart, which nulls its ripple.
 
     What leaks from the mirror frequency has half a fringe's period. Where the comb leaves the valid
     surface or crosses an edge, the phase itself is taken.
@@ -48,8 +43,8 @@ def _smooth_base(phase: NDArray[np.float32], quarter_px: int, base: NDArray[np.f
     q, quarter, two, limit = quarter_px, np.float32(0.25), np.float32(2.0), np.float32(0.5)
     width = phase.size
     base[:] = phase
-    left, here, right, inner = phase[: width - 2 * q], phase[q : width - q], phase[2 * q :], base[q : width
-    - q] for x in range(inner.size):
+    left, here, right, inner = phase[: width - 2 * q], phase[q : width - q], phase[2 * q :], base[q : width - q]
+    for x in range(inner.size):
         e = here[x]
         bend = left[x] - two * e + right[x]
         inner[x] = e + quarter * bend if abs(bend) < limit else e
