@@ -18,6 +18,7 @@ from endo3d.services.cli.options import JsonOption, SetOption
 if TYPE_CHECKING:
     from rich.progress import Progress
 
+    from endo3d.services.cli.pace import Pace
     from endo3d.services.cli.up import Asked
     from endo3d.services.cli.watch import Watch
     from endo3d.services.runtime.bus import Bus
@@ -50,8 +51,13 @@ def demo(
     folder = out or Path("out") / f"demo-{datetime.now(UTC):%Y%m%d-%H%M%S}"
     folder.mkdir(parents=True, exist_ok=True)
     settings = [*_recording(folder), *(overrides or ())]
-    figures = scan(stack, [*_pace(stack, settings, quiet=as_json), *settings], seconds, quiet=as_json)
-    report = write(folder, figures)
+    pace = _pace(stack, settings)
+    if pace is not None:
+        settings = [*pace.overrides(), *settings]
+        if not as_json:
+            print(pace.describe(), file=sys.stderr)
+    figures = scan(stack, settings, seconds, quiet=as_json)
+    report = write(folder, {**figures, "render_ms": pace.render_ms if pace else None})
     if as_json:
         print(json.dumps(report, indent=2))
     else:
@@ -63,20 +69,14 @@ def _recording(folder: Path) -> list[str]:
     return [f"recorder.directory={folder.resolve()}", "recorder.name=scan", "recorder.autostart=true"]
 
 
-def _pace(stack: str, settings: list[str], quiet: bool) -> list[str]:
-    """What makes the demo fit this machine, unless somebody has chosen a rate or a camera."""
-    from endo3d.services.cli import pace
+def _pace(stack: str, settings: list[str]) -> Pace | None:
+    """What makes the demo fit this machine; None when somebody has chosen a rate or a camera."""
+    from endo3d.services.cli.pace import measure
     from endo3d.services.runtime import stack_file
 
     if any(setting.startswith(("sequencer.rate_hz=", "grabber.camera=")) for setting in settings):
-        return []
-    fitting = pace.measure(stack_file.load(stack, settings))
-    if fitting is None:
-        return []
-    if not quiet:
-        rate = f"{fitting.rate_hz:g} Hz, a scan at {pace.PAPER_HZ:g} Hz in slow motion {fitting.slow_motion:.1f}"
-        print(f"Rendering takes {fitting.render_ms:.1f} ms per frame here, now: {rate}.", file=sys.stderr)
-    return fitting.overrides()
+        return None
+    return measure(stack_file.load(stack, settings))
 
 
 def scan(

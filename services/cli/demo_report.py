@@ -78,27 +78,22 @@ def _against_truth(comparison: Comparison | None) -> dict[str, Any] | None:
 
 def show(report: dict[str, Any]) -> None:
     """The table."""
-    table = Table(
-        box=box.SIMPLE_HEAD, show_header=False, title="endo3d demo (simulated)", title_justify="left"
-    )
+    table = Table(box=box.SIMPLE_HEAD, show_header=False, title="endo3d demo (simulated)", title_justify="left")
     slow = f", in slow motion {report['slow_motion']:.1f}" if report["slow_motion"] > 1 else ""
     table.add_row("first cloud", f"{report['start_s']:.1f} s after the command")
-    table.add_row("frames", f"{report['frames']} at {report['rate_hz']:.1f} Hz{slow}")
+    render = f"; rendering took {report['render_ms']:.0f} ms each at the start" if report["render_ms"] else ""
+    table.add_row("frames", f"{report['frames']} at {report['rate_hz']:.1f} Hz{slow}{render}")
     table.add_row("lost", _lost(report["lost"]))
     for name, key in (("exposure to cloud", "latency_cloud_ms"), ("exposure to pose", "latency_pose_ms")):
         table.add_row(name, f"p50 {report[key]['p50']:.1f} ms, p99 {report[key]['p99']:.1f} ms")
-    merged = (
-        f", merged at {1e3 * report['merging_distance_mm']:.0f} um" if report["merging_distance_mm"] else ""
-    )
+    merged = f", merged at {1e3 * report['merging_distance_mm']:.0f} um" if report["merging_distance_mm"] else ""
     table.add_row("map", f"{report['map_points']} points{merged}")
     for name, text in _truth_rows(report):
         table.add_row(name, text)
     for name, path in report["files"].items():
         table.add_row(name, path)
     if report["restarts"]:
-        table.add_row(
-            "restarted", ", ".join(f"{name} {count}x" for name, count in report["restarts"].items())
-        )
+        table.add_row("restarted", ", ".join(f"{name} {count}x" for name, count in report["restarts"].items()))
     console = Console()
     console.print(table)
     console.print(f"Look at it: [bold]endo3d view {report['files']['log']}[/]")
@@ -106,8 +101,7 @@ def show(report: dict[str, Any]) -> None:
 
 def _lost(lost: dict[str, dict[str, int]]) -> str:
     hops = (
-        f"{name}: " + ", ".join(f"{cause} {count}" for cause, count in causes.items())
-        for name, causes in lost.items()
+        f"{name}: " + ", ".join(f"{cause} {count}" for cause, count in causes.items()) for name, causes in lost.items()
     )
     return "\n".join(hops) or "nothing, at any hop"
 

@@ -39,6 +39,10 @@ class Pace:
     def slow_motion(self) -> float:
         return PAPER_HZ / self.rate_hz
 
+    def describe(self) -> str:
+        scan = f"a scan at {PAPER_HZ:g} Hz in slow motion {self.slow_motion:.1f}"
+        return f"Rendering takes {self.render_ms:.1f} ms per frame on this machine now: {self.rate_hz:g} Hz, {scan}."
+
     def overrides(self) -> list[str]:
         return [f"sequencer.rate_hz={self.rate_hz:.1f}", f"grabber.camera={self.camera}"]
 

@@ -61,6 +61,7 @@ class Child:
     process: subprocess.Popen[bytes] | None = field(default=None, repr=False)
     pidfd: int = -1
     partial: bytes = b""
+    last_line: str = ""
 
     @property
     def pid(self) -> int | None:
@@ -82,9 +83,7 @@ class Launcher:
     turns. Nothing is left running, even if this process is killed: see ``follow_parent``.
     """
 
-    def __init__(
-        self, children: Sequence[Child], sink: Sink, environment: Mapping[str, str] | None = None
-    ) -> None:
+    def __init__(self, children: Sequence[Child], sink: Sink, environment: Mapping[str, str] | None = None) -> None:
         self.children = list(children)
         self.sink = sink
         self.environment = {**_one_thread_each(), **os.environ, **(environment or {})}
@@ -128,9 +127,7 @@ class Launcher:
         if self.user_error:
             return EXIT_USER_ERROR
         fine = (0, None, -signal.SIGTERM)
-        return int(
-            any(child.state is State.GIVEN_UP or child.exit_code not in fine for child in self.children)
-        )
+        return int(any(child.state is State.GIVEN_UP or child.exit_code not in fine for child in self.children))
 
     def stop(self, grace_s: float = STOP_GRACE_S, hurry: Callable[[], bool] = lambda: False) -> None:
         """Stop all, sources first and one after the other, so that what is under way still arrives.
@@ -190,8 +187,12 @@ class Launcher:
             while chunk := os.read(child.process.stdout.fileno(), 65536):
                 *lines, child.partial = (child.partial + chunk).split(b"\n")
                 for line in lines:
-                    self.sink(child.name, line.decode(errors="replace"))
+                    self._say(child, line)
             self.selector.unregister(child.process.stdout)
+
+    def _say(self, child: Child, line: bytes) -> None:
+        child.last_line = line.decode(errors="replace")
+        self.sink(child.name, child.last_line)
 
     def _reap(self, child: Child) -> None:
         """A process is gone: collect its last words and decide."""
@@ -205,9 +206,8 @@ class Launcher:
             self._read(child)
         if process.stdout in self.selector.get_map():
             self.selector.unregister(process.stdout)
-        last_words = child.partial.decode(errors="replace")
-        if last_words:
-            self.sink(child.name, last_words)
+        if child.partial:
+            self._say(child, child.partial)
         process.stdout.close()
         self.selector.unregister(child.pidfd)
         os.close(child.pidfd)
@@ -222,7 +222,7 @@ class Launcher:
             return
         if code == EXIT_USER_ERROR and child.total_restarts == 0:
             child.state = State.GIVEN_UP
-            self.user_error = f"{child.name} could not start; its last line says what to do"
+            self.user_error = f"{child.name}: {child.last_line.removeprefix('endo3d: ')}"
             return
         if time.monotonic() - child.started_at_s > SETTLED_S:
             child.restarts = 0
@@ -237,9 +237,7 @@ class Launcher:
         child.restarts += 1
         child.total_restarts += 1
         child.state, child.restart_at_s = State.WAITING, time.monotonic() + wait_s
-        self.sink(
-            child.name, f"{describe_exit(code)}; restart {child.restarts} of {len(BACKOFF_S)} in {wait_s} s"
-        )
+        self.sink(child.name, f"{describe_exit(code)}; restart {child.restarts} of {len(BACKOFF_S)} in {wait_s} s")
 
     @staticmethod
     def _signal(child: Child, number: signal.Signals) -> None:

@@ -78,9 +78,7 @@ def test_check_prints_the_graph_in_every_language() -> None:
         return ended.stdout
 
     assert "frame (Frame, up to 180 Hz, shared memory) → decoder" in check()
-    assert {"key": "endo3d/demo/cloud", "from": "decoder", "to": "odometry"} in json.loads(check("--json"))[
-        "edges"
-    ]
+    assert {"key": "endo3d/demo/cloud", "from": "decoder", "to": "odometry"} in json.loads(check("--json"))["edges"]
     assert check("--mermaid").startswith("flowchart LR\n    sequencer -->|mode| grabber")
     assert check("--keys", "odometry").count("merging_distance_um") == 1
 
@@ -88,9 +86,7 @@ def test_check_prints_the_graph_in_every_language() -> None:
 def test_the_shell_can_complete() -> None:
     script = Path(sys.executable).with_name("endo3d")
     asked = {"_ENDO3D_COMPLETE": "complete_bash", "COMP_WORDS": "endo3d check dem", "COMP_CWORD": "2"}
-    ended = subprocess.run(
-        [script], capture_output=True, text=True, timeout=LIMIT_S, env={**os.environ, **asked}
-    )
+    ended = subprocess.run([script], capture_output=True, text=True, timeout=LIMIT_S, env={**os.environ, **asked})
     assert ended.stdout.split() == ["demo"]
 
 
@@ -122,6 +118,11 @@ class TestBadInput:
         stack = tmp_path / "play.toml"
         stack.write_text('[player]\nlog = "gone.mcap"\n')
         assert f"can't read {tmp_path}/gone.mcap" in complaint("run", "player", "--stack", str(stack))
+
+    def test_a_service_that_cannot_start_ends_the_stack(self, tmp_path: Path) -> None:
+        stack = tmp_path / "play.toml"
+        stack.write_text(f'[rig]\nname = "play{os.getpid()}"\n[player]\nlog = "gone.mcap"\n[decoder]\n')
+        assert complaint("up", str(stack)).startswith(f"endo3d: player: can't read {tmp_path}/gone.mcap")
 
     def test_unknown_topic(self) -> None:
         assert "no topic 'clouds'; there are: frame, cloud" in complaint("tap", "clouds")
@@ -182,9 +183,7 @@ def test_a_service_that_refuses_its_values_names_its_table() -> None:
 def test_doctor_reports_and_ends_with_its_verdict(tmp_path: Path) -> None:
     ended = endo3d("doctor", "--json", "--directory", str(tmp_path))
     findings = {finding["name"]: finding for finding in json.loads(ended.stdout)}
-    assert {"locked memory", "/dev/shm", "processor", "projector", "display", "packages", "disk"} <= set(
-        findings
-    )
+    assert {"locked memory", "/dev/shm", "processor", "projector", "display", "packages", "disk"} <= set(findings)
     assert all(finding["todo"] for finding in findings.values() if finding["level"] != "ok")
     assert ended.returncode == int(any(finding["level"] == "fatal" for finding in findings.values()))
 
