@@ -17,9 +17,9 @@ from endo3d_core.registration import Frame6, NormalEquations
 Array = NDArray[np.float64]
 
 WEAK = 0.1
-"""Geometry with a larger 1-sigma than this, in point sigmas, asks the texture for help."""
-HELD = 1.0
-"""A direction that is known no better than a single point, 1-sigma in point sigmas, is not moved at all."""
+"""Geometry with a larger 1-sigma than this, in units of the points' spread, asks the texture for help."""
+HELD = 2.0
+"""A direction that is known worse than twice the spread of single points is not moved at all."""
 SIGNAL = 1.0 - 1.0 / 1.4
 """Least share of signal in the cloud's texture gradients along a direction: their energy is then 1.4 times that of
 their noise. Less is mostly shading, which moves with the camera."""
@@ -35,8 +35,6 @@ class Solution:
     """(6, 6) 1/mm^2, scaled coordinates, without what noise alone would make."""
     held: Array
     """(6, k) orthonormal directions that are held."""
-    weak: bool
-    """Some direction asked the texture for help."""
     sigma_weak_mm: float
     weak_direction: Array
     """(6,) unit vector, scaled coordinates."""
@@ -45,31 +43,30 @@ class Solution:
 
 
 def solve(n: NormalEquations, sigma_mm: float) -> Solution:
-    """Gauss-Newton step in the observable directions; ``sigma_mm`` is the points' noise."""
-    geometry = n.geometry - n.geometry_noise
+    """Gauss-Newton step in the observable directions; ``sigma_mm`` is what the cloud says of its points' noise."""
+    # More spread than that (errors that are no noise) makes the geometry that much less certain; the photometric
+    # rows are weighted by their own spread.
+    spread_mm = max(sigma_mm, n.residual_mm)
+    shrink = (sigma_mm / spread_mm) ** 2
+    geometry = shrink * (n.geometry - n.geometry_noise)
     values, vectors = np.linalg.eigh(geometry)
-    weak = vectors[:, values < 1.0 / (WEAK * sigma_mm) ** 2]
-    textured = _textured_directions(n, weak)
+    textured = _textured_directions(n, vectors[:, values < 1.0 / (WEAK * spread_mm) ** 2])
     P = textured @ textured.T
     texture = P @ n.texture @ P
-    # More spread than the points' sigma says (model errors) makes every estimate that much less certain.
-    excess = max(1.0, n.residual_mm / sigma_mm) ** 2
-    information = (geometry + texture) / excess
+    information = geometry + texture
+    gradient = shrink * n.geometry_gradient + P @ n.texture_gradient
     values, vectors = np.linalg.eigh(information)
-    free = vectors[:, values >= 1.0 / (HELD * sigma_mm) ** 2]
-    held = vectors[:, values < 1.0 / (HELD * sigma_mm) ** 2]
-    gradient = n.geometry_gradient + P @ n.texture_gradient
-    step = free @ np.linalg.solve(free.T @ (geometry + texture) @ free, free.T @ gradient)
-    in_weak = float(np.trace(textured.T @ geometry @ textured)) if textured.size else 0.0
+    known = values >= 1.0 / (HELD * spread_mm) ** 2
+    free = vectors[:, known]
+    from_geometry = max(float(np.trace(textured.T @ geometry @ textured)), 0.0)
     from_texture = float(np.trace(texture))
     return Solution(
-        step=step,
+        step=free @ (free.T @ gradient / values[known]),
         information=information,
-        held=held,
-        weak=weak.size > 0,
+        held=vectors[:, ~known],
         sigma_weak_mm=float(1.0 / np.sqrt(max(values[0], 1e-12))),
         weak_direction=vectors[:, 0],
-        photometric_share=from_texture / (from_texture + max(in_weak, 0.0)) if from_texture > 0 else 0.0,
+        photometric_share=from_texture / (from_texture + from_geometry) if textured.size else 0.0,
     )
 
 

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
 
 from endo3d_core import health, rigid
-from endo3d_core.live_view import LiveView
+from endo3d_core.live_view import POOL, LiveView
 from endo3d_core.merging import MergedMap
-from endo3d_core.recovery import recover
+from endo3d_core.recovery import believable, convincing, recover
 from endo3d_core.registration import Frame6, Linearisation, NormalEquations, Scales, visible_surface
 
 Array = NDArray[np.float64]
@@ -21,11 +21,11 @@ _CONVERGED = 0.1
 """A step smaller than this, in point sigmas, ends the iteration: the next would be far smaller still."""
 _COARSE = 4
 """The first iteration only has to take in what the prediction missed: every fourth map point does."""
-_LEAST_SHARE = 0.35
-"""Of the visible map points that must agree with the cloud."""
 _LEAST_POINTS = 300
-_LEAST_SLOPE = 0.6
-"""Where there is texture: least slope of the cloud's over the map's; at a wrong place it is zero."""
+_LEAST_SHARE = 0.04
+"""Of the grid's cells that must be valid for a cloud to count."""
+_HARDLY_A_MAP = 10
+"""Clouds that a map must hold to be worth a search."""
 _PATIENCE = 30
 """Clouds that may fail to recover before a new submap begins."""
 _LEAST_TEXTURE = 0.001
@@ -76,22 +76,31 @@ class Odometry:
         self._period_ns = 0
         self._scale_mm = np.nan
         self._texture_scale = 0.1
+        self._tilt_rad = 0.0
         self.submap = 0
         self._failures = 0
+        self._merged = 0
         self._visible = self.map.touched
 
     def track(self, channels: NDArray[np.float32], sequence: int, stamp_ns: int) -> Estimate:
         """One cloud (height, width, 6) float32: x y z mm, intensity, quality, sigma mm."""
-        if self._load(channels) < _LEAST_POINTS:
+        if self._load(channels) < max(_LEAST_POINTS, _LEAST_SHARE * channels.shape[0] * channels.shape[1] / POOL**2):
             return self._lost()
         if self._last_ns is None:
-            return self._begin(sequence, stamp_ns)
-        estimate = None if self._is_lost(stamp_ns) else self._register(self._predict(stamp_ns), stamp_ns)
-        if estimate is not None:
-            self.map.merge(self.view.live, estimate.T_world_camera, sequence)
-            self._visible = self.map.touched
+            estimate = self._begin(stamp_ns)
+            self._merge(sequence)
             return estimate
-        return self._recover(sequence, stamp_ns)
+        estimate = None if self._failures else self._register(self._predict(stamp_ns), stamp_ns)
+        if estimate is None:
+            estimate = self._recover(sequence, stamp_ns)
+        if estimate.state is not State.LOST and estimate.state is not State.RELOCALISED:
+            self._merge(sequence)
+        return estimate
+
+    def _merge(self, sequence: int) -> None:
+        self.map.merge(self.view.live, self.T_world_camera, sequence)
+        self._visible = self.map.touched
+        self._merged += 1
 
     def _load(self, channels: NDArray[np.float32]) -> int:
         """The number of pooled points; 0 also when nothing can be told from the cloud."""
@@ -100,41 +109,45 @@ class Odometry:
         except ValueError:
             return 0
 
-    def _begin(self, sequence: int, stamp_ns: int) -> Estimate:
+    def _begin(self, stamp_ns: int) -> Estimate:
+        """The first cloud of a map defines where it is: nothing is uncertain yet."""
         self._last_ns = stamp_ns
+        self._velocity[:] = 0.0
+        self._period_ns, self._failures, self._merged = 0, 0, 0
         self._scale_mm = 2.0 * self.view.sigma_mm
-        self.map.merge(self.view.live, self.T_world_camera, sequence)
-        self._visible = self.map.touched
+        self._texture_scale, self._tilt_rad = 0.1, 0.0
         return Estimate(
             self.T_world_camera, np.diag(np.full(6, 1e12)), State.TRACKING, 0.0, np.zeros(6), 1.0, 0.0, 0.0, self.submap
         )
 
-    def _is_lost(self, stamp_ns: int) -> bool:
-        """Also after a gap: what comes back may look like another place."""
+    def _is_stale(self, stamp_ns: int) -> bool:
+        """The last pose is too old to say much about this one."""
         assert self._last_ns is not None
         gap_ns = stamp_ns - self._last_ns
-        return self._failures > 0 or gap_ns <= 0 or (gap_ns > _LONGEST_GAP * self._period_ns > 0)
+        return gap_ns <= 0 or gap_ns > _LONGEST_GAP * self._period_ns > 0
 
     def _predict(self, stamp_ns: int) -> Array:
         assert self._last_ns is not None
+        if self._is_stale(stamp_ns):
+            return self.T_world_camera
         return self.T_world_camera @ rigid.exp(self._velocity * (stamp_ns - self._last_ns))
 
     def _recover(self, sequence: int, stamp_ns: int) -> Estimate:
-        """Wide search against the map; a new submap when that keeps failing."""
+        """Wide search against the map; a new one when that keeps failing, or at once if there is hardly one yet."""
         self._failures += 1
         found = recover(self.view, self.map, self.T_world_camera, self._equations)
         if found is not None:
-            self._failures = 0
-            self.T_world_camera, self._last_ns = rigid.orthonormal(found.T_world_camera), stamp_ns
-            self._velocity[:] = 0.0
             self._visible = found.visible
             self._scale_mm, self._texture_scale = found.equations.residual_mm, found.equations.texture_residual
-            return self._estimate(State.RELOCALISED, found.equations, found.solution, found.frame)
-        if self._failures > _PATIENCE:
-            self._failures = 0
-            self.submap += 1
+            estimate = self._register(found.T_world_camera, stamp_ns)
+            if estimate is not None:
+                self._failures = 0
+                self._velocity[:] = 0.0
+                return replace(estimate, state=State.RELOCALISED)
+        if self._merged < _HARDLY_A_MAP or self._failures > _PATIENCE:
+            self.submap += self._merged >= _HARDLY_A_MAP
             self.map.clear()
-            return self._begin(sequence, stamp_ns)
+            return self._begin(stamp_ns)
         return self._lost()
 
     def _register(self, predicted: Array, stamp_ns: int) -> Estimate | None:
@@ -143,7 +156,7 @@ class Odometry:
         frame = visible_surface(view.live)
         T, rows = predicted, self._visible
         gate_mm = 8.0 * self._scale_mm + view.pitch_mm
-        scales = Scales(gate_mm, 0.5 * gate_mm, 4.0 * self._texture_scale, view.normal_rad)
+        scales = Scales(gate_mm, 0.5 * gate_mm, 4.0 * self._texture_scale, max(self._tilt_rad, view.normal_rad))
         for iteration in range(ITERATIONS):
             chosen = rows if iteration else rows[::_COARSE]
             n = self._equations.at(T, self.map, chosen, view.live, view.coefficients, frame, scales)
@@ -152,10 +165,11 @@ class Odometry:
             solution = health.solve(n, sigma_mm)
             T = T @ health.motion(solution.step, frame)
             scale_mm = max(n.residual_mm, sigma_mm)
-            scales = Scales(8.0 * scale_mm, scale_mm, max(n.texture_residual, _LEAST_TEXTURE), view.normal_rad)
+            self._tilt_rad = max(n.tilt_rad, view.normal_rad)
+            scales = Scales(8.0 * scale_mm, scale_mm, max(n.texture_residual, _LEAST_TEXTURE), self._tilt_rad)
             if iteration and np.linalg.norm(solution.step) < _CONVERGED * sigma_mm:
                 break
-        if n.used < _LEAST_SHARE * n.visible or (n.textured_scene and n.texture_slope < _LEAST_SLOPE):
+        if not (convincing(n) if self._is_stale(stamp_ns) else believable(n)):
             return None
         self._scale_mm, self._texture_scale = min(scale_mm, 4.0 * sigma_mm), scales.texture
         self._advance(rigid.orthonormal(T), stamp_ns, solution.held, frame)

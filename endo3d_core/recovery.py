@@ -28,10 +28,10 @@ SCORED_POINTS = 1200
 CANDIDATES = 6
 GATES_CELLS = (6.0, 3.0, 1.5, 1.0)
 """Gates of the registration from a candidate, widest first, in pooled cells."""
-CONVINCING_SHARE = 0.6
-"""Of the visible map points that must agree before a pose is believed."""
-CONVINCING_TEXTURE = 0.75
-"""Where there is texture: least slope of the cloud's texture over the map's (1 = the same)."""
+CONVINCING_SHARE, BELIEVABLE_SHARE = 0.6, 0.35
+"""Of the visible map points that must agree: for a pose found by searching, and for a predicted one."""
+CONVINCING_TEXTURE, BELIEVABLE_TEXTURE = 0.75, 0.6
+"""Where there is texture: least slope of the cloud's over the map's; 1 is the same, a wrong place gives 0."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,10 +74,18 @@ def recover(view: LiveView, world: MergedMap, T_last: Array, linearisation: Line
 
 
 def convincing(n: NormalEquations) -> bool:
-    """Enough points agree in place, and in texture if there is any."""
-    if n.visible == 0 or n.used < CONVINCING_SHARE * n.visible:
-        return False
-    return not n.textured_scene or n.texture_slope > CONVINCING_TEXTURE
+    """Enough points agree in place, and in texture if there is any, to believe a pose that nothing predicted."""
+    return _agrees(n, CONVINCING_SHARE, CONVINCING_TEXTURE)
+
+
+def believable(n: NormalEquations) -> bool:
+    """The same for a pose that was predicted."""
+    return _agrees(n, BELIEVABLE_SHARE, BELIEVABLE_TEXTURE)
+
+
+def _agrees(n: NormalEquations, least_share: float, least_slope: float) -> bool:
+    in_place = n.visible > 0 and n.used >= least_share * n.visible
+    return in_place and not (n.textured_scene and n.texture_slope < least_slope)
 
 
 def nearby(world: MergedMap, T_last: Array, view: LiveView, frame: Frame6) -> NDArray[np.int32]:

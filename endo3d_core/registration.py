@@ -28,11 +28,16 @@ GRAZING = 0.3
 FACING = 0.9
 """Least view cosine of a photometric row: on flanks, shading changes with the pose."""
 
+_TILT_STRIDE = 8
 SETTLED = 16
 """Measured points from which on a map point's texture is compared as a whole: its noise is a quarter of one's."""
 
-_SURFACE_ROWS = 11
-"""J (6), distance, then 1 and the scaled position (3) weighted with the noise of the normal."""
+_AVERAGED = 25.0
+"""Averaging makes normals at most so many times less noisy (in variance): ripple of the decoder is no white noise."""
+
+_SURFACE_ROWS = 12
+"""J (6), distance, then 1 and the scaled position (3) weighted with the noise of the normal, and one minus the cosine
+between the normals."""
 _TEXTURE_ROWS = 13
 """J with the map's gradient (6), with the cloud's (6), difference."""
 
@@ -58,7 +63,7 @@ class Scales:
     texture: float
     """Robust scale of differences in texture."""
     normal_rad: float
-    """1-sigma tilt of one cloud's normals."""
+    """1-sigma tilt of one cloud's normals, about each axis."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,6 +85,8 @@ class NormalEquations:
     textured: int
     residual_mm: float
     """Robust rms of the distances."""
+    tilt_rad: float
+    """Typical angle about one axis between normals of map and cloud: their noise."""
     texture_residual: float
     """The same of the differences in texture, at the cloud's typical brightness."""
     texture_slope: float
@@ -130,7 +137,7 @@ class Linearisation:
         visible, used, textured, settled = counts
         squares, weights, texture_squares, texture_weights, of_map, of_both, inverse_counts = sums
         surface = _gram(self._surface[:7], used)
-        tilted = _gram(self._surface[7:], used)
+        tilted = _gram(self._surface[7:11], used)
         texture = _gram(self._texture, textured)
         geometry = surface[:6, :6]
         tilt_variance = tilted[0, 0] / max(np.trace(geometry[:3, :3]), 1e-300)
@@ -145,6 +152,7 @@ class Linearisation:
             used=used,
             textured=textured,
             residual_mm=float(np.sqrt(squares / max(weights, 1e-30))),
+            tilt_rad=float(np.sqrt(np.median(self._surface[11, :used:_TILT_STRIDE]) / np.log(2.0))) if used else 0.0,
             texture_residual=float(np.sqrt(texture_squares / max(texture_weights, 1e-30))),
             texture_slope=of_both / max(of_map, 1e-30),
             texture_rms=float(np.sqrt(of_map / max(settled, 1))),
@@ -238,7 +246,8 @@ def _rows(  # type: ignore[no-untyped-def]
         nx = r00 * m[3] + r01 * m[4] + r02 * m[5]
         ny = r10 * m[3] + r11 * m[4] + r12 * m[5]
         nz = r20 * m[3] + r21 * m[4] + r22 * m[5]
-        if nx * q[3] + ny * q[4] + nz * q[5] < f(SAME_SURFACE):
+        cosine = nx * q[3] + ny * q[4] + nz * q[5]
+        if cosine < f(SAME_SURFACE):
             continue
         facing = -(nx * a + ny * b + nz) / np.sqrt(one + r2)
         if facing < f(GRAZING):
@@ -263,8 +272,9 @@ def _rows(  # type: ignore[no-untyped-def]
         surface[4, used] = w * (sz * nx - sx * nz)
         surface[5, used] = w * (sx * ny - sy * nx)
         surface[6, used] = w * residual
-        tilt = w * tilt_scale / np.sqrt(count)
+        tilt = w * tilt_scale / np.sqrt(min(count, f(_AVERAGED)))
         surface[7, used], surface[8, used], surface[9, used], surface[10, used] = tilt, tilt * sx, tilt * sy, tilt * sz
+        surface[11, used] = one - cosine
         used += 1
         if not (facing >= f(FACING) and q[7] == q[7]):
             continue
