@@ -42,9 +42,7 @@ def meeting_ports(rig: str, first: int | None = None) -> range:
     return range(first, first + _MEETING_PORTS)
 
 
-def open_session(
-    ports: range, *, shared_memory: bool, settings: Mapping[str, Any] | None = None
-) -> zenoh.Session:
+def open_session(ports: range, *, shared_memory: bool, settings: Mapping[str, Any] | None = None) -> zenoh.Session:
     """Join the processes that meet at ``ports``.
 
     settings: zenoh configuration, path -> value, over the built-in one (endpoints of other hosts, TLS).
@@ -56,9 +54,7 @@ def open_session(
                 return _open(_settings(ports, port, shared_memory) | dict(settings or {}))
             except zenoh.ZError as error:
                 if _is_free(port):
-                    raise UserError(
-                        f"zenoh does not start: {error}; check the stack file's zenoh settings"
-                    ) from None
+                    raise UserError(f"zenoh does not start: {error}; check the stack file's zenoh settings") from None
     session = _open(_settings(ports, None, shared_memory) | dict(settings or {}))
     if not _meets_someone(session):
         session.close()
@@ -108,6 +104,9 @@ def _settings(ports: range, listen: int | None, shared_memory: bool) -> dict[str
         "transport/unicast/accept_timeout": _ANSWER_MS,
         # and a stopped reader keeps what was sent to it until its link is cut: a writer's pool lasts 0.2 s.
         "transport/link/tx/lease": _ANSWER_MS,
+        # A busy machine may let the sending thread wait: bursts are queued meanwhile.
+        "transport/link/tx/queue/size/data": 16,
+        "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 5_000,
         # The caches of latched topics go by timestamps.
         "timestamping/enabled": True,
         "transport/shared_memory/enabled": shared_memory,

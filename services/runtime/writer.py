@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from typing import Final
+from typing import Any, Final
 
 import zenoh
 from zenoh.ext import CacheConfig, MissDetectionConfig, declare_advanced_publisher
@@ -15,30 +15,34 @@ _SEQUENCE_MASK: Final = 0xFFFF_FFFF
 
 
 class Writer:
-    """Puts payloads of one topic, never waiting for a reader; the last of a latched topic is kept."""
+    """Puts payloads of one topic. The last of a latched topic is kept for late readers.
+
+    Bulk samples are dropped where they can't be sent at once: no reader may hold the camera back. Small ones
+    wait their turn, and at most until the link to a reader that stopped is cut.
+    """
 
     def __init__(self, session: zenoh.Session, topic: Topic, key: str) -> None:
-        encoding = zenoh.Encoding.APPLICATION_PROTOBUF.with_schema(codec.schema(topic).name)
         self._lock = threading.Lock()
         self._sequence = 0
         self._latched: zenoh.ext.AdvancedPublisher | None = None
         self._plain: zenoh.Publisher | None = None
+        quality: dict[str, Any] = {
+            "encoding": zenoh.Encoding.APPLICATION_PROTOBUF.with_schema(codec.schema(topic).name),
+            "congestion_control": zenoh.CongestionControl.DROP if topic.bulk else zenoh.CongestionControl.BLOCK,
+            "priority": zenoh.Priority.DATA if topic.bulk else zenoh.Priority.DATA_HIGH,
+            "express": topic.bulk,
+        }
         if topic.latched:
             self._latched = declare_advanced_publisher(
                 session,
                 key,
-                encoding=encoding,
                 cache=CacheConfig(1),
                 sample_miss_detection=MissDetectionConfig(heartbeat=None, sporadic_heartbeat=1.0),
                 publisher_detection=True,
+                **quality,
             )
         else:
-            self._plain = session.declare_publisher(
-                key,
-                encoding=encoding,
-                congestion_control=zenoh.CongestionControl.DROP,
-                express=True,
-            )
+            self._plain = session.declare_publisher(key, **quality)
 
     def put(self, payload: zenoh.ZBytes | bytes) -> None:
         if self._latched is not None:

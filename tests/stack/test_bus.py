@@ -207,6 +207,28 @@ def test_every_service_has_its_own_log_key(bus: Bus, rig: str) -> None:
     assert sources == ["grabber", "decoder"]
 
 
+def test_a_burst_of_small_messages_arrives_whole(rig: str) -> None:
+    """A busy machine lets zenoh's sending thread wait: what is published meanwhile must queue, not vanish."""
+    lines: list[int] = []
+    last = threading.Event()
+    burst = topics.LOG.depth
+
+    def take(message: Message) -> None:
+        assert isinstance(message, LogLine)
+        lines.append(message.line)
+        if message.line == burst - 1:
+            last.set()
+
+    with Bus.open(rig, name="writer") as writer, Bus.open(rig, name="reader") as reader:
+        reader.subscribe(topics.LOG, take)
+        reader.declare_alive()
+        wait_for(writer, "reader")
+        for line in range(burst):
+            writer.publish(LogLine(1, Level.INFO, "x" * 200, "writer", line=line))
+        assert last.wait(20)
+    assert lines == list(range(burst))
+
+
 def test_two_rigs_side_by_side_do_not_meet(bus: Bus, rig: str) -> None:
     ours, theirs = Collector(), Collector()
     with (
