@@ -81,7 +81,7 @@ class Stack:
     path: Path | None
     """None when it came from a log."""
     base: Path
-    """What relative paths in it start from."""
+    """What relative paths in it start from: the file's folder, for a stock stack the current one."""
     toml: str
     """The effective text, overrides applied."""
     rig: RigTable
@@ -95,7 +95,7 @@ class Stack:
     @property
     def head(self) -> Path:
         """The file with the calibration."""
-        return _stock_or_file("head", self.rig.head, "heads", ".yaml", self.base)[0]
+        return _stock_or_file("head", self.rig.head, "heads", ".yaml", self.base)
 
     @cached_property
     def entries(self) -> tuple[Entry, ...]:
@@ -122,9 +122,7 @@ class Stack:
         paths = {
             key: str(self.base / Path(value).expanduser())
             for key, value in given.items()
-            if isinstance(value, str)
-            and key in model.model_fields
-            and _is_path(model.model_fields[key].annotation)
+            if isinstance(value, str) and key in model.model_fields and _is_path(model.model_fields[key].annotation)
         }
         try:
             return model.model_validate(known | given | paths)
@@ -157,17 +155,15 @@ def load(source: str | Path, overrides: Sequence[str] = ()) -> Stack:
 
     Raises ``UserError`` for a missing file, bad TOML, a bad override or a bad ``[rig]`` table.
     """
-    path, stock = _stock_or_file("stack", str(source), "stacks", ".toml", Path.cwd())
+    path = _stock_or_file("stack", str(source), "stacks", ".toml", Path.cwd())
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise UserError(f"can't read {path}: {error}; check the file") from None
-    return loads(text, overrides, path=path, base=Path.cwd() if stock else path.parent)
+    return loads(text, overrides, path=path, base=Path.cwd() if path in stock("stacks").values() else path.parent)
 
 
-def loads(
-    text: str, overrides: Sequence[str] = (), *, path: Path | None = None, base: Path | None = None
-) -> Stack:
+def loads(text: str, overrides: Sequence[str] = (), *, path: Path | None = None, base: Path | None = None) -> Stack:
     """Parse a stack's text, e.g. the one that a log carries."""
     label = str(path) if path else "stack"
     try:
@@ -177,9 +173,7 @@ def loads(
     stray = [key for key, value in tables.items() if not isinstance(value, dict)]
     if stray:
         line = line_of(text, "", stray[0])
-        raise UserError(
-            f"{label}:{line}: {stray[0]!r} stands outside of a table; move it below [rig] or a service"
-        )
+        raise UserError(f"{label}:{line}: {stray[0]!r} stands outside of a table; move it below [rig] or a service")
     for override in overrides:
         _override(tables, override)
     if overrides:
@@ -194,7 +188,7 @@ def loads(
 
 def stock(kind: str) -> dict[str, Path]:
     """The stock files that come with endo3d: ``stacks`` or ``heads``, by name."""
-    folder = Path(str(resources.files("endo3d.deploy"))) / kind
+    folder = Path(str(resources.files("endo3d.deploy"))).resolve() / kind
     return {path.stem: path for path in sorted(folder.iterdir()) if path.suffix in (".toml", ".yaml")}
 
 
@@ -245,9 +239,7 @@ def _plain_value(text: str) -> Any:
 
 def _toml_value(value: Any) -> str:
     if isinstance(value, dict):
-        return (
-            "{" + ", ".join(f"{_toml_value(key)} = {_toml_value(item)}" for key, item in value.items()) + "}"
-        )
+        return "{" + ", ".join(f"{_toml_value(key)} = {_toml_value(item)}" for key, item in value.items()) + "}"
     if isinstance(value, list):
         return "[" + ", ".join(_toml_value(item) for item in value) + "]"
     if isinstance(value, str | bool):
@@ -255,14 +247,14 @@ def _toml_value(value: Any) -> str:
     return str(value)
 
 
-def _stock_or_file(what: str, name: str, kind: str, suffix: str, base: Path) -> tuple[Path, bool]:
-    """The file meant by a name, and whether it is a stock one."""
+def _stock_or_file(what: str, name: str, kind: str, suffix: str, base: Path) -> Path:
+    """The file meant by a path or by a stock file's name."""
     path = base / Path(name).expanduser()
     if path.is_file():
-        return path.resolve(), False
+        return path.resolve()
     known = stock(kind)
     if name in known:
-        return known[name], True
+        return known[name]
     looks_like_file = "/" in name or name.endswith(suffix)
     hint = "check the path" if looks_like_file else _nearest(name, known)
     raise UserError(f"no {what} {name!r} here; {hint}")
@@ -275,9 +267,7 @@ def _service_class(module: str, where: str) -> type[Service[Any]]:
         loaded = importlib.import_module(qualified)
     except ModuleNotFoundError as error:
         if error.name == qualified or (error.name and qualified.startswith(error.name + ".")):
-            raise UserError(
-                f"{where}: no service module {module!r}; {_nearest(module, service_modules())}"
-            ) from None
+            raise UserError(f"{where}: no service module {module!r}; {_nearest(module, service_modules())}") from None
         raise UserError(f"service {module!r} needs the package {error.name!r}; pip install it") from None
     kinds = [
         kind
@@ -285,9 +275,7 @@ def _service_class(module: str, where: str) -> type[Service[Any]]:
         if inspect.isclass(kind) and issubclass(kind, Service) and kind.__module__ == loaded.__name__
     ]
     if len(kinds) != 1:
-        raise UserError(
-            f"{where}: module {module!r} holds {len(kinds)} services, not one; name another module"
-        )
+        raise UserError(f"{where}: module {module!r} holds {len(kinds)} services, not one; name another module")
     return kinds[0]
 
 

@@ -59,6 +59,13 @@ def test_entries_in_flow_order_with_shared_values_and_paths(stack_path: Path) ->
     assert type(decoder.build()).__name__ == "Decoder"
 
 
+def test_paths_of_a_stock_stack_start_where_you_are(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By its name or, as in the processes of the launcher, by its path."""
+    monkeypatch.chdir(tmp_path)
+    for source in ("demo", stack_file.stock("stacks")["demo"]):
+        assert stack_file.load(source).entry("recorder").config.model_dump()["directory"] == tmp_path / "out"
+
+
 def test_override_reaches_the_config_and_the_text(stack_path: Path) -> None:
     stack = stack_file.load(stack_path, ("decoder.mode=three-frame", "decoder.bins=2", "rig.name=other"))
     assert stack.entry("decoder").config.model_dump() == {"mode": "three-frame", "bins": 2}
