@@ -18,8 +18,8 @@ Array = NDArray[np.float64]
 
 WEAK = 0.1
 """Geometry with a larger 1-sigma than this, in units of the points' spread, asks the texture for help."""
-HELD = 2.0
-"""A direction that is known worse than twice the spread of single points is not moved at all."""
+HELD = 1.0
+"""A direction that is known worse than the spread of single points is not moved at all."""
 SIGNAL = 1.0 - 1.0 / 1.4
 """Least share of signal in the cloud's texture gradients along a direction: their energy is then 1.4 times that of
 their noise. Less is mostly shading, which moves with the camera."""
