@@ -309,6 +309,31 @@ def test_a_stopped_reader_knows_that_its_frames_are_void(rig: str) -> None:
         assert not all(whole), "the writer never came round: the test shows nothing"
 
 
+def test_a_reader_that_was_cut_off_comes_back(rig: str) -> None:
+    with Bus.open(rig, name="writer") as bus, Peer(read_frames, rig, {}) as reader:
+        reader.hear()
+        wait_for(bus, "reader")
+        bus.publish(frame(bus, 0))
+        reader.ask(("until", 0))
+        gone, back = threading.Event(), threading.Event()
+
+        def see(name: str, is_there: bool) -> None:
+            if gone.is_set() and is_there:
+                back.set()
+            elif not is_there:
+                gone.set()
+
+        bus.watch_alive(see)
+        reader.signal(signal.SIGSTOP)
+        assert gone.wait(10)
+        reader.signal(signal.SIGCONT)
+        assert back.wait(10)
+        bus.publish(frame(bus, 1))
+        sequences, broken, _ = reader.ask(("until", 1))
+        assert sequences == [0, 1]
+        assert broken == 0
+
+
 def test_a_slow_reader_misses_and_counts_but_slows_nobody(rig: str) -> None:
     count = 60
     with Bus.open(rig, name="writer") as bus, Peer(read_frames, rig, {}, 0.05) as reader:
