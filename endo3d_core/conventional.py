@@ -252,6 +252,10 @@ class Conventional:
         """Forget the sequence so far: after a lost frame or a new epoch."""
         self.count = 0
 
+    def restart(self) -> None:
+        """A new epoch."""
+        self.reset()
+
     def push(self, image: Image, slot: int) -> bool:
         """Take the next frame; True when it completes a sequence. A slot out of turn starts again at slot
         0."""

@@ -23,6 +23,7 @@ from endo3d_core import bandpass, triangulation, uncertainty, unwrap, windowed_f
 from endo3d_core.binning import Image, bin_image
 from endo3d_core.compiled import kernel
 from endo3d_core.patterns import PatternSet
+from endo3d_core.slot_check import SlotCheck
 from endo3d_core.triangulation import Lookup
 
 Form = Literal["three", "five", "reuse"]
@@ -137,6 +138,7 @@ class Interleaved:
         self.filters = [bandpass.gabor(lookup.period_px / (f * lookup.centre_slope)) for f in (self.f1, self.f2)]
         self.count = 0
         self.slot = -1
+        self._label = -1
         shape = (lookup.height, lookup.width)
         self._padded = [np.zeros(lookup.width + 2 * gabor.taps, np.float32) for gabor in self.filters]
         self._grids = np.zeros((6, *shape), np.float32)
@@ -149,6 +151,15 @@ class Interleaved:
         self.modulation, self.residual, self.intensity, self.quality = np.zeros((4, *shape), np.float32)
         self.variance = np.zeros(shape, np.float32)
         self._grey_variance = sensor.variance(bin_px)
+        self.slots = SlotCheck(
+            self.filters[0],
+            max(1, round(abs(lookup.period_px / (self.f1 * lookup.centre_slope)) / 2)),
+            self._carrier,
+            self.f1,
+            self.f2,
+            lookup.reach_px * self.rad_per_px,
+            dark_grey,
+        )
         self._quarter_px = max(1, round(abs(lookup.period_px / (self.f1 * lookup.centre_slope)) / 4))
         self._fit_rows = np.zeros((5, lookup.width), np.float32)
         self._fit_sums = np.zeros((3, 6, lookup.width), np.float32)
@@ -156,23 +167,38 @@ class Interleaved:
         self._row = np.zeros((triangulation.ROW_PLANES, lookup.width), np.float32)
 
     def reset(self) -> None:
-        """Forget the window: after a lost frame, a new epoch, a slipped slot."""
+        """Forget the window: after a lost frame or a slipped slot."""
         self.count = 0
 
+    def restart(self) -> None:
+        """Forget the window and what was learnt about the slots: a new epoch."""
+        self.reset()
+        self.slots.restart()
+
     def push(self, image: Image, slot: int) -> bool:
-        """Take the next frame; True when a result is ready. A slot out of turn starts a new window."""
-        if self.count and slot != (self.slot + 1) % PERIOD:
+        """Take the next frame; True when a result is ready.
+
+        A label out of turn starts a new window, and so does a slip that the images show; a negative label stands for
+        the next slot.
+        """
+        label = slot if slot >= 0 else self._label + 1
+        if self.count and label % PERIOD != (self._label + 1) % PERIOD:
             self.reset()
-        self.slot = slot
+        self._label = label % PERIOD
+        self.slot = self.slots.slot(self._label)
         self.count += 1
         if self.lookup.axis == "columns":
             bin_image(image, self.bin_px, self._grid(0))
         else:
             bin_image(image, self.bin_px, self._transposed)
             self._grid(0)[:] = self._transposed.T
+        if self.count >= 3 and not self.slots.examine(self._grid(2), self._grid(1), self._grid(0), self._label):
+            # The newest frame may begin a window, or be the first after its slot was put right.
+            self._start_over()
+            return False
         if self.form == "reuse" and self.count >= 5:
             self._filter_reuse(back=2)
-        if self.count < self.frames:
+        if self.count < self.frames or not self.slots.trusted:
             return False
         self._decode()
         return True
@@ -194,6 +220,12 @@ class Interleaved:
             self._row,
             out if lookup.axis == "columns" else out.transpose(1, 0, 2),
         )
+
+    def _start_over(self) -> None:
+        """Keep the newest frame as the first of a new window, under the slot that is believed now."""
+        self._grids[0] = self._grid(0)
+        self.count = 1
+        self.slot = self.slots.slot(self._label)
 
     def _grid(self, back: int) -> NDArray[np.float32]:
         """The binned frame ``back`` frames before the newest."""

@@ -43,6 +43,8 @@ class Lookup:
     """Projector pixels of the coded axis: a frequency counts periods over these."""
     centre_slope: float
     """Median of d x_c / d column, in projector px per grid px: the carrier."""
+    reach_px: float
+    """The most that x_p leaves x_c within the depth range, in projector px."""
     axis: Axis
 
 
@@ -92,6 +94,7 @@ def build(rig: Rig, bin_px: int, z_min_mm: float, z_max_mm: float, axis: Axis = 
         z_min_mm=z_min_mm,
         z_max_mm=z_max_mm,
         period_px=float(period),
+        reach_px=float(scale),
         centre_slope=float(np.median(np.diff(centre, axis=1))),
         axis=axis,
     )

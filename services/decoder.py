@@ -92,7 +92,7 @@ class Decoder(service.Service[DecoderConfig]):
         small = Rig(self.rig.camera.binned(8), self.rig.projector, self.rig.R, self.rig.t)
         image = np.full((small.camera.height, small.camera.width), 100, np.uint8)
         for text in ("interleaved f1=3", "conventional f=4/3 steps=3/2"):
-            for bin_px in BINS:
+            for bin_px in (self.config.bin_px,) if self.config.bin_px else (2, 4):
                 decoder = self._build(text, small, bin_px, np.dtype(np.uint8))
                 out = np.empty((decoder.lookup.height, decoder.lookup.width, CHANNELS), np.float32)
                 for k in range(decoder.frames):
@@ -121,6 +121,8 @@ class Decoder(service.Service[DecoderConfig]):
         if self._last not in (None, (frame.epoch, frame.sequence - 1)):
             # A lost frame or another start of the projector: these never decode together.
             self._counts["windows_dropped"] += 1.0
+            if self._last is not None and self._last[0] != frame.epoch:
+                decoder.restart()
             decoder.reset()
         self._last = (frame.epoch, frame.sequence)
         self._window.append((frame.stamp_ns, frame.sequence))
@@ -147,6 +149,7 @@ class Decoder(service.Service[DecoderConfig]):
             pattern_set=frame.pattern_set,
             grid_px=grid_px,
             valid_count=valid,
+            slot_slips=decoder.slots.slips if isinstance(decoder, Interleaved) else 0,
             frame_id=frame.frame_id,
         )
         if self.config.depth:
