@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from endo3d.schemas import codec, topics
 from endo3d.schemas import messages as m
+from endo3d.services.archive.entry import Entry
+from endo3d.services.archive.recording import Recording
+from endo3d.services.archive.writer import Kind
 from endo3d.services.views.colouring import visible
 from endo3d_core.merging import MAP_POINT
 
@@ -93,7 +98,18 @@ def messages(
         yield m.Transform(stamp_ns, "world", "camera", T)
         rows = visible(map_of(points), -21.0, -19.0)
         yield m.MapDelta(stamp_ns, k, rows, np.zeros((0, 3), np.int16), k, k == 0, len(rows), 0.2)
-        yield m.Status(
-            stamp_ns, "decoder", "host", 1, m.ServiceState.RUNNING, "", 25.0, 9.0, 14.0, 0.4, 120.0
-        )
+        yield m.Status(stamp_ns, "decoder", "host", 1, m.ServiceState.RUNNING, "", 25.0, 9.0, 14.0, 0.4, 120.0)
         yield m.LogLine(stamp_ns, m.Level.INFO, f"frame {k}", "decoder")
+
+
+def write_log(path: Path, frames: int = 4) -> None:
+    """The same as a log, as a recorder would have written it."""
+    recording = Recording(path, {})
+    for sequence, message in enumerate(messages(frames)):
+        topic = topics.of(message)
+        kind = Kind(*codec.schema(topic))
+        channel = topic.channel(getattr(message, "service", ""))
+        payload = (codec.encode(message),)
+        arrived_ns = message.stamp_ns + sequence
+        recording.put(Entry(channel, kind, sequence, arrived_ns, message.stamp_ns, payload))
+    recording.finish()

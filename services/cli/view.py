@@ -66,7 +66,7 @@ def _draw(log: Log, path: Path, colour: str, by_rerun: bool) -> None:
             _write(log, recording, colour)
             rerun_picture(recording, path)
         return
-    scan = Scan.of(log.messages())
+    scan = Scan.of_log(log)
     deviation_um = _deviation(scan)(scan.points()) if colour == "deviation" else None
     picture(scan, path, colour=colour, deviation_um=deviation_um)
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from endo3d.schemas import topics
 from endo3d.schemas.messages import (
     POINT,
     CameraCalibration,
@@ -23,8 +24,10 @@ from endo3d.schemas.messages import (
     Tracking,
     Truth,
 )
+from endo3d.services.archive.reader import Log
 from endo3d.services.views.merged import MergedMap
 
+SECOND_NS = 1_000_000_000
 KEEP_GROWTH = 1.25
 """A shown frame is replaced when the log has grown by this: it ends up from the last fifth of the scan."""
 
@@ -90,6 +93,23 @@ class Scan:
         scan = cls()
         for message in messages:
             scan.add(message)
+        return scan
+
+    @classmethod
+    def of_log(cls, log: Log) -> Scan:
+        """Of a finished log, reading what is shown only: small messages whole, images of one second."""
+        scan = cls.of(log.messages(*(topic for topic in topics.TOPICS if not topic.bulk)))
+        at_ns = log.end_ns - round(0.2 * (log.end_ns - log.start_ns))
+        images = log.messages(topics.FRAME, topics.DEPTH, start_ns=at_ns, end_ns=at_ns + SECOND_NS)
+        for message in images:
+            scan.add(message)
+        # of many clouds one is enough to know the working distance; without a map the last one is what is shown
+        clouds_from_ns = at_ns if scan.merged.points() is not None else 0
+        for message in log.messages(topics.CLOUD, start_ns=clouds_from_ns):
+            scan.add(message)
+        stamps_ns = [record.publish_ns for record in log.records((topics.FRAME,), check=False)]
+        if stamps_ns:
+            scan.frames, scan.first_ns, scan.last_ns = len(stamps_ns), min(stamps_ns), max(stamps_ns)
         return scan
 
     @property

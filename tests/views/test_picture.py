@@ -13,9 +13,10 @@ import rerun.blueprint as rrb
 from hypothesis import given
 from hypothesis import strategies as st
 from rerun.chunk import RrdReader
-from scans import map_of, messages, points_of
+from scans import map_of, messages, points_of, write_log
 
 from endo3d.schemas import messages as m
+from endo3d.services.archive.reader import Log
 from endo3d.services.runtime.errors import UserError
 from endo3d.services.views import entries
 from endo3d.services.views.blueprint import scan_blueprint
@@ -70,6 +71,19 @@ def test_a_scan_keeps_nothing_of_the_memory_it_was_shown() -> None:
             image[:] = 0
     assert scan.frame is not None
     assert scan.frame.image.any()
+
+
+def test_a_log_is_summed_up_without_reading_every_image(tmp_path: Path) -> None:
+    write_log(tmp_path / "scan.mcap", frames=40)
+    log = Log(tmp_path / "scan.mcap")
+    quick, whole = Scan.of_log(log), Scan.of(log.messages())
+    assert (quick.frames, quick.seconds) == (whole.frames, whole.seconds) == (40, pytest.approx(39 / 25))
+    np.testing.assert_array_equal(quick.points(), whole.points())
+    np.testing.assert_array_equal(quick.track(), whole.track())
+    assert quick.working_distance_mm == whole.working_distance_mm
+    assert quick.frame is not None
+    assert quick.frame.sequence >= 31
+    assert quick.depth is not None
 
 
 def test_colours_run_from_low_to_high_and_nan_is_grey() -> None:
