@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+if TYPE_CHECKING:
+    from endo3d.services.evaluation.measure import Settings
 
 EXPERIMENTS = ("spheres", "cylinder", "handheld")
 
@@ -20,6 +23,9 @@ def evaluate(
     page: Annotated[
         Path | None, typer.Option("--page", help="Write all reports of the folder as one page too.")
     ] = None,
+    frames: Annotated[
+        Path | None, typer.Option("--frames", help="Keep the rendered frames there: measuring again is quick.")
+    ] = None,
     threads: Annotated[int, typer.Option(min=1, help="Threads that render.")] = os.cpu_count() or 1,
     as_json: Annotated[bool, typer.Option("--json", help="Print the figures instead of the tables.")] = False,
 ) -> None:
@@ -28,20 +34,22 @@ def evaluate(
     Simulated frames go through the decoder's and the odometry's own steps. An interrupted run goes on where it
     stopped. Examples: endo3d evaluate spheres --quick; endo3d evaluate all --page docs/evaluation.md
     """
+    from endo3d.services.evaluation.measure import Settings
     from endo3d.services.runtime.errors import UserError
 
     if experiment not in (*EXPERIMENTS, "all"):
         raise UserError(f"no experiment {experiment!r}; there are: {', '.join(EXPERIMENTS)}, all")
     out.mkdir(parents=True, exist_ok=True)
     for name in EXPERIMENTS if experiment == "all" else (experiment,):
-        _run(name, out, quick, threads, as_json)
+        _run(name, Settings(out, quick, threads, frames), as_json)
     if page is not None:
         _write(page, out)
 
 
-def _run(name: str, out: Path, quick: bool, threads: int, as_json: bool) -> None:
+def _run(name: str, settings: Settings, as_json: bool) -> None:
     import importlib
     import json
+    from dataclasses import replace
 
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -51,14 +59,15 @@ def _run(name: str, out: Path, quick: bool, threads: int, as_json: bool) -> None
     module = importlib.import_module(f"endo3d.services.evaluation.{name}")
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=Console(stderr=True)) as bar:
-        task = bar.add_task(f"{name} ({SIMULATED})", total=module.steps(quick))
-        report = module.evaluate(out, quick, threads, lambda done: bar.update(task, completed=done))
-    report.save(out)
+        task = bar.add_task(f"{name} ({SIMULATED})", total=module.steps(settings.quick))
+        watched = replace(settings, progress=lambda done: bar.update(task, completed=done))
+        report = module.evaluate(watched)
+    report.save(settings.folder)
     if as_json:
         print(json.dumps({"simulated": True, **report.figures}))
     else:
         _print(report)
-        print(f"written: {out / report.name}.html, .json, .png")
+        print(f"written: {settings.folder / report.name}.html, .json, .png")
 
 
 def _print(report: object) -> None:

@@ -14,18 +14,16 @@ from typing import Any
 Result = dict[str, Any] | None
 
 
+MEASURING = ("endo3d_core", "endo3d_core.virtual_rig", "endo3d.services", "endo3d.services.evaluation")
+"""The packages whose code decides what is measured."""
+
+
 @once
-def program() -> str:
-    """A fingerprint of the code that measures: results of other code don't count."""
+def program(*packages: str) -> str:
+    """A fingerprint of code: results of other code don't count."""
     digest = hashlib.sha256()
-    for package in (
-        "endo3d_core",
-        "endo3d_core.virtual_rig",
-        "endo3d.services",
-        "endo3d.services.evaluation",
-    ):
-        folder = Path(str(files(package)))
-        for path in sorted(folder.glob("*.py")):
+    for package in packages:
+        for path in sorted(Path(str(files(package))).glob("*.py")):
             digest.update(path.read_bytes())
     return digest.hexdigest()[:16]
 
@@ -38,7 +36,7 @@ class Cache:
         self._results: dict[str, Result] = {}
         if path.exists():
             kept = json.loads(path.read_text(encoding="utf-8"))
-            if kept.get("program") == program():
+            if kept.get("program") == program(*MEASURING):
                 self._results = kept["results"]
 
     def get(self, name: str, work: Callable[[], Result]) -> Result:
@@ -47,6 +45,6 @@ class Cache:
             self._results[name] = work()
             self._path.parent.mkdir(parents=True, exist_ok=True)
             fresh = self._path.with_suffix(".new")
-            fresh.write_text(json.dumps({"program": program(), "results": self._results}), encoding="utf-8")
+            fresh.write_text(json.dumps({"program": program(*MEASURING), "results": self._results}), encoding="utf-8")
             os.replace(fresh, self._path)
         return self._results[name]

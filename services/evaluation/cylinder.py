@@ -10,7 +10,7 @@ import numpy as np
 from endo3d.services.evaluation import figures_of_merit as merit
 from endo3d.services.evaluation.cache import Cache, Result
 from endo3d.services.evaluation.calibrated import calibrated
-from endo3d.services.evaluation.measure import Progress, clouds, merged, moved, points_of
+from endo3d.services.evaluation.measure import Merging, Settings, clouds, moved, points_of
 from endo3d.services.evaluation.report import Report, Table
 from endo3d.services.evaluation.virtual_run import VirtualRun, head_yaml
 from endo3d.services.views.figures import COLOURS, figure
@@ -57,19 +57,19 @@ def _plan(quick: bool) -> list[tuple[str, float, int]]:
     return [(mode, speed, k) for k in range(1 if quick else REPETITIONS) for speed in speeds for mode in MODES]
 
 
-def evaluate(folder: Path, quick: bool, threads: int, progress: Progress) -> Report:
+def evaluate(settings: Settings) -> Report:
     """Measure, or take what was measured before; tables, plots and figures."""
+    folder, quick = settings.folder, settings.quick
     name = "cylinder-quick" if quick else "cylinder"
     cache = Cache(folder / f"{name}.cache.json")
-    bin_px = 2 if quick else 1
     results: dict[tuple[str, float], list[Result]] = {}
     done = 0
     for mode, speed, k in _plan(quick):
-        work = partial(_measure, "all effects", mode, speed, k, bin_px, threads)
+        work = partial(_measure, settings, "all effects", mode, speed, k)
         result = cache.get(f"{mode} {speed} {k}", work)
         results.setdefault((mode, speed), []).append(result)
         done += 1
-        progress(done)
+        settings.progress(done)
     shares: dict[str, list[Result]] = {}
     for variant in () if quick else SHARES:
         speed = 0.0 if variant == "without motion" else SHARE_SPEED_MM_S
@@ -77,15 +77,15 @@ def evaluate(folder: Path, quick: bool, threads: int, progress: Progress) -> Rep
             if variant == "all effects":
                 result = results["continuous", SHARE_SPEED_MM_S][k]
             else:
-                work = partial(_measure, variant, "continuous", speed, k, bin_px, threads)
+                work = partial(_measure, settings, variant, "continuous", speed, k)
                 result = cache.get(f"{variant} {k}", work)
                 done += 1
-                progress(done)
+                settings.progress(done)
             shares.setdefault(variant, []).append(result)
     return _report(folder, name, results, shares)
 
 
-def _measure(variant: str, mode: str, speed_mm_s: float, k: int, bin_px: int, threads: int) -> Result:
+def _measure(settings: Settings, variant: str, mode: str, speed_mm_s: float, k: int) -> Result:
     """One repetition: the standard is put down anew, the stage passes the middle at half time."""
     rng = np.random.default_rng((k, int(10 * speed_mm_s)))
     dx, dy = rng.uniform(-0.2, 0.2, 2)
@@ -101,17 +101,20 @@ def _measure(variant: str, mode: str, speed_mm_s: float, k: int, bin_px: int, th
         FRAMES,
         seed=k,
         effects=FULL.without(*SHARES[variant]),
-        bin_px=bin_px,
+        bin_px=2 if settings.quick else 1,
     )
-    known = None if variant == "with exact calibration" else calibrated(true)
-    measured = list(clouds(run, known, threads))
+    known = true if variant == "with exact calibration" else calibrated(true)
+    measured = list(clouds(settings, run, known))
     if not measured:
         return None
     if mode == "conventional":
         cloud, truth = measured[0]
         points = moved(truth.T_scene_camera, points_of(cloud))
     else:
-        points = merged(measured, MERGING_UM, at_least=2, true_poses=variant == "with true poses").points
+        merging = Merging(MERGING_UM, true_poses=variant == "with true poses")
+        for cloud, truth in measured:
+            merging.add(cloud, truth)
+        points = merging.map(at_least=2).points
     return merit.cylinder(points, x_mm, standard.RADIUS_LARGE_MM)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,7 @@ import numpy as np
 from endo3d.services.evaluation import figures_of_merit as merit
 from endo3d.services.evaluation.cache import Cache, Result
 from endo3d.services.evaluation.calibrated import calibrated
-from endo3d.services.evaluation.measure import Map, Points, Progress, clouds, merged
+from endo3d.services.evaluation.measure import Clouds, Map, Merging, Points, Settings
 from endo3d.services.evaluation.report import Report, Table
 from endo3d.services.evaluation.virtual_run import VirtualRun, head_yaml
 from endo3d.services.views.figures import COLOURS, RAMPS, figure
@@ -54,48 +54,81 @@ PAPER: dict[str, tuple[float, float, float, str]] = {
 """Table 5: reference, measured, form deviation / um."""
 
 
+RENDERED = ("without fibres", "without noise", "without motion blur")
+"""The variants that need frames of their own; the others share those of the whole scan."""
+
+
 def steps(quick: bool) -> int:
     """Frames in all."""
-    if quick:
-        return round(QUICK_S * RATE_HZ)
-    return round(RATE_HZ * (DURATION_S + len(VARIANTS) * SHARE_DURATION_S))
+    return _frames(QUICK_S) if quick else _frames(DURATION_S) + len(RENDERED) * _frames(SHARE_DURATION_S)
 
 
-def evaluate(folder: Path, quick: bool, threads: int, progress: Progress) -> Report:
+def _frames(seconds: float) -> int:
+    return round(seconds * RATE_HZ)
+
+
+def evaluate(settings: Settings) -> Report:
     """Measure, or take what was measured before; tables, plots and figures."""
-    name = "handheld-quick" if quick else "handheld"
-    cache = Cache(folder / f"{name}.cache.json")
-    duration_s = QUICK_S if quick else DURATION_S
-    scan = folder / f"{name}.map.npz"
-    done = 0
-
-    def measured(variant: str, seconds: float, keep: Path | None) -> Callable[[], Result]:
-        return lambda: _measure(variant, seconds, threads, lambda n: progress(done + n), keep)
-
-    result = cache.get("scan", measured("all effects", duration_s, scan))
-    done += round(duration_s * RATE_HZ)
-    progress(done)
+    name = "handheld-quick" if settings.quick else "handheld"
+    cache = Cache(settings.folder / f"{name}.cache.json")
+    seconds = QUICK_S if settings.quick else DURATION_S
+    kept = settings.folder / f"{name}.map.npz"
+    result = cache.get("scan", partial(_scan, settings, seconds, kept)) or {}
     shares: dict[str, Result] = {}
-    for variant in () if quick else VARIANTS:
-        shares[variant] = cache.get(variant, measured(variant, SHARE_DURATION_S, None))
-        done += round(SHARE_DURATION_S * RATE_HZ)
-        progress(done)
-    return _report(folder, name, duration_s, result or {}, shares, scan)
+    if not settings.quick:
+        shares |= result["shares"]
+        for k, variant in enumerate(RENDERED):
+            before = _frames(DURATION_S) + k * _frames(SHARE_DURATION_S)
+            shares[variant] = cache.get(variant, partial(_variant, settings, variant, before))
+        shares = {variant: shares[variant] for variant in VARIANTS}
+    return _report(settings.folder, name, seconds, result, shares, kept)
 
 
-def _measure(variant: str, seconds: float, threads: int, progress: Progress, keep: Path | None) -> Result:
-    true = head_yaml(HEAD)
+def _run(variant: str, seconds: float) -> VirtualRun:
     effects = FULL.without(*VARIANTS[variant])
-    run = VirtualRun(true, SCENE, MOTION, PATTERNS, RATE_HZ, round(seconds * RATE_HZ), effects=effects, bin_px=BIN_PX)
-    known = None if variant == "with exact calibration" else calibrated(true)
-    found = merged(
-        clouds(run, known, threads, progress),
-        MERGING_UM,
-        at_least=AT_LEAST,
-        true_poses=variant == "with true poses",
-    )
-    if keep is not None:
-        np.savez(keep, points=found.points.astype(np.float32), path=found.estimated[:, :3, 3])
+    frames = _frames(seconds)
+    return VirtualRun(head_yaml(HEAD), SCENE, MOTION, PATTERNS, RATE_HZ, frames, effects=effects, bin_px=BIN_PX)
+
+
+def _scan(settings: Settings, seconds: float, kept: Path) -> Result:
+    """The whole scan; beside it, as long as the shares last, with exact calibration and with true poses."""
+    run, true = _run("all effects", seconds), head_yaml(HEAD)
+    decoding, exact = Clouds(run, calibrated(true)), Clouds(run, true)
+    hand, exact_hand = Merging(MERGING_UM), Merging(MERGING_UM)
+    placed = Merging(MERGING_UM, true_poses=True)
+    shares: dict[str, Result] = {}
+    share_frames = 0 if settings.quick else _frames(SHARE_DURATION_S)
+    for done, (frame, truth) in enumerate(settings.shots(run), start=1):
+        for cloud, where in decoding.of(frame, truth):
+            hand.add(cloud, where)
+            if done <= share_frames:
+                placed.add(cloud, where)
+        if done <= share_frames:
+            for cloud, where in exact.of(frame, truth):
+                exact_hand.add(cloud, where)
+        if done == share_frames:
+            shares["all effects"] = _outcome(hand)
+            shares["with exact calibration"] = _outcome(exact_hand)
+            shares["with true poses"] = _outcome(placed)
+        settings.progress(done)
+    found = hand.map(AT_LEAST)
+    np.savez(kept, points=found.points.astype(np.float32), path=found.estimated[:, :3, 3])
+    return {**_outcome(hand), "shares": shares}
+
+
+def _variant(settings: Settings, variant: str, before: int) -> Result:
+    """The first seconds again, with frames that lack an effect."""
+    run = _run(variant, SHARE_DURATION_S)
+    decoding, hand = Clouds(run, calibrated(head_yaml(HEAD))), Merging(MERGING_UM)
+    for done, (frame, truth) in enumerate(settings.shots(run), start=1):
+        for cloud, where in decoding.of(frame, truth):
+            hand.add(cloud, where)
+        settings.progress(before + done)
+    return _outcome(hand)
+
+
+def _outcome(merging: Merging) -> dict[str, Any]:
+    found = merging.map(AT_LEAST)
     return {"features": features(found.points), "odometry": _odometry(found)}
 
 

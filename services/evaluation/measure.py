@@ -4,35 +4,73 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from endo3d.schemas.messages import Cloud, Pose, Truth
+from endo3d.schemas.messages import Cloud, Frame, Pose, Truth
 from endo3d.services.decoder import Decoder
+from endo3d.services.evaluation import prerender
 from endo3d.services.evaluation.virtual_run import VirtualRun
 from endo3d.services.odometry import Odometry
 
 Points = NDArray[np.float64]
-Progress = Callable[[int], None]
+Measured = tuple[Cloud, Truth]
+"""A cloud with the truth of the frame it belongs to."""
 
 
-def clouds(
-    run: VirtualRun, calibration_yaml: str | None = None, threads: int = 1, progress: Progress | None = None
-) -> Iterator[tuple[Cloud, Truth]]:
-    """Each cloud with the truth of the frame it belongs to."""
-    decoder = Decoder(Decoder.Config(depth=False))
-    for message in run.calibration(calibration_yaml):
-        list(decoder.step(message))
-    truths: dict[int, Truth] = {}
-    for frame, truth in run.shots(threads=threads):
-        truths[frame.sequence] = truth
-        truths.pop(frame.sequence - 64, None)
-        for message in decoder.step(frame):
+def ignore(done: int) -> None:
+    """Progress that nobody watches."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How an evaluation is to be carried out."""
+
+    folder: Path
+    """Reports, plots, and what was measured so far."""
+    quick: bool = False
+    threads: int = 1
+    """That render."""
+    frames: Path | None = None
+    """Where rendered frames are kept: measuring them again with another decoder needs no rendering."""
+    progress: Callable[[int], None] = ignore
+
+    def shots(self, run: VirtualRun) -> Iterable[tuple[Frame, Truth]]:
+        """A run's frames, rendered now or earlier."""
+        if self.frames is None:
+            return run.shots(threads=self.threads)
+        path = self.frames / f"{prerender.name(run)}.mcap"
+        if not path.exists():
+            self.frames.mkdir(parents=True, exist_ok=True)
+            prerender.prerender(run, path, self.threads, ignore)
+        return prerender.frames_of(path)
+
+
+class Clouds:
+    """The decoder's own steps over the frames of a run."""
+
+    def __init__(self, run: VirtualRun, calibration_yaml: str) -> None:
+        self._decoder = Decoder(Decoder.Config(depth=False))
+        for message in run.calibration(calibration_yaml):
+            list(self._decoder.step(message))
+        self._truths: dict[int, Truth] = {}
+
+    def of(self, frame: Frame, truth: Truth) -> Iterator[Measured]:
+        """The clouds that this frame completes."""
+        self._truths[frame.sequence] = truth
+        self._truths.pop(frame.sequence - 64, None)
+        for message in self._decoder.step(frame):
             if isinstance(message, Cloud):
-                yield message, truths[message.sequence]
-        if progress is not None:
-            progress(frame.sequence + 1)
+                yield message, self._truths[message.sequence]
+
+
+def clouds(settings: Settings, run: VirtualRun, calibration_yaml: str) -> Iterator[Measured]:
+    """All clouds of a run."""
+    decoding = Clouds(run, calibration_yaml)
+    for frame, truth in settings.shots(run):
+        yield from decoding.of(frame, truth)
 
 
 def points_of(cloud: Cloud) -> Points:
@@ -62,42 +100,40 @@ class Map:
     """Clouds per tracking state."""
 
 
-def merged(
-    measured: Iterable[tuple[Cloud, Truth]],
-    merging_distance_um: float,
-    *,
-    at_least: int,
-    true_poses: bool = False,
-) -> Map:
-    """Register and merge; points with ``at_least`` so many observations stay.
+class Merging:
+    """The odometry's own steps over clouds; or, with ``true_poses``, the truth in the registration's place."""
 
-    With ``true_poses`` the truth takes the registration's place: what is left is not its share.
-    """
-    service = Odometry(Odometry.Config.model_validate({"merging_distance_um": merging_distance_um}))
-    odometry = service.odometry
-    estimated: list[NDArray[np.float64]] = []
-    true: list[NDArray[np.float64]] = []
-    states: dict[str, int] = {}
-    for cloud, truth in measured:
-        if true_poses:
-            T_scene_camera = truth.T_scene_camera
-            T_world_camera = np.linalg.inv(true[0]) @ T_scene_camera if true else np.eye(4)
+    def __init__(self, merging_distance_um: float, *, true_poses: bool = False) -> None:
+        config = Odometry.Config.model_validate({"merging_distance_um": merging_distance_um})
+        self._service, self._true_poses = Odometry(config), true_poses
+        self._estimated: list[NDArray[np.float64]] = []
+        self._true: list[NDArray[np.float64]] = []
+        self._states: dict[str, int] = {}
+
+    def add(self, cloud: Cloud, truth: Truth) -> None:
+        """One cloud more."""
+        self._true.append(truth.T_scene_camera)
+        if self._true_poses:
+            T_world_camera = np.linalg.inv(self._true[0]) @ truth.T_scene_camera
+            odometry = self._service.odometry
             odometry.view.load(cloud.channels)
             odometry.map.merge(odometry.view.live, T_world_camera, cloud.sequence)
             state = "true"
         else:
-            pose = next(m for m in service.step(cloud) if isinstance(m, Pose))
+            pose = next(m for m in self._service.step(cloud) if isinstance(m, Pose))
             T_world_camera, state = pose.T_world_camera, str(pose.state)
-        estimated.append(T_world_camera)
-        true.append(truth.T_scene_camera)
-        states[state] = states.get(state, 0) + 1
-    points = odometry.map.points(at_least)
-    xyz = np.stack([points[axis] for axis in "xyz"], axis=-1).astype(np.float64)
-    T_scene_world = true[0]
-    return Map(
-        moved(T_scene_world, xyz),
-        points["count"].astype(np.int64),
-        np.stack([T_scene_world @ T for T in estimated]),
-        np.stack(true),
-        states,
-    )
+        self._estimated.append(T_world_camera)
+        self._states[state] = self._states.get(state, 0) + 1
+
+    def map(self, at_least: int) -> Map:
+        """What was merged so far; points with ``at_least`` so many observations."""
+        points = self._service.odometry.map.points(at_least)
+        xyz = np.stack([points[axis] for axis in "xyz"], axis=-1).astype(np.float64)
+        T_scene_world = self._true[0]
+        return Map(
+            moved(T_scene_world, xyz),
+            points["count"].astype(np.int64),
+            np.stack([T_scene_world @ T for T in self._estimated]),
+            np.stack(self._true),
+            dict(self._states),
+        )

@@ -16,6 +16,7 @@ from endo3d.services.archive.reader import Log, Unreadable
 from endo3d.services.archive.recording import Recording
 from endo3d.services.archive.recover import recover
 from endo3d.services.archive.writer import Kind
+from endo3d.services.evaluation.cache import program
 from endo3d.services.evaluation.virtual_run import VirtualRun
 from endo3d.services.runtime.errors import UserError
 
@@ -34,13 +35,13 @@ def prerender(run: VirtualRun, path: Path, threads: int, progress: Callable[[int
         raise UserError(f"{path} exists; remove it, or choose another name")
     if unfinished.exists():
         _keep(unfinished, kept, run)
-    recording = Recording(unfinished, {**host_facts(), DESCRIPTION: _name(run)})
+    recording = Recording(unfinished, {**host_facts(), DESCRIPTION: name(run)})
     done = 0
     try:
         for message in (*run.calibration(), run.mode()):
             recording.put(_entry(message))
         if kept.exists():
-            for frame, truth in _frames_of(kept):
+            for frame, truth in frames_of(kept):
                 _put(recording, frame, truth)
                 done += 1
             kept.unlink()
@@ -69,7 +70,7 @@ def _keep(unfinished: Path, kept: Path, run: VirtualRun) -> None:
     except Unreadable:
         unfinished.unlink()  # it ended before its first whole chunk
         return
-    if facts.get(DESCRIPTION) != _name(run):
+    if facts.get(DESCRIPTION) != name(run):
         raise UserError(f"{unfinished} is of another rendering; remove it, or choose another name")
     if kept.exists() and Log(kept).count(topics.FRAME) > Log(unfinished).count(topics.FRAME):
         unfinished.unlink()  # interrupted while it took over what was kept
@@ -77,7 +78,7 @@ def _keep(unfinished: Path, kept: Path, run: VirtualRun) -> None:
         os.replace(unfinished, kept)
 
 
-def _frames_of(log: Path) -> Iterator[tuple[Frame, Truth]]:
+def frames_of(log: Path) -> Iterator[tuple[Frame, Truth]]:
     """Whole pairs, from the first frame on, without a gap."""
     truths = {m.sequence: m for m in Log(log).messages(topics.TRUTH) if isinstance(m, Truth)}
     for expected, message in enumerate(Log(log).messages(topics.FRAME)):
@@ -104,6 +105,7 @@ def _entry(message: Message) -> Entry:
     )
 
 
-def _name(run: VirtualRun) -> str:
-    """Tells runs apart: a hash of everything that decides the frames."""
-    return hashlib.sha256(repr(sorted(asdict(run).items())).encode()).hexdigest()
+def name(run: VirtualRun) -> str:
+    """Tells runs apart: a hash of everything that decides the frames, the program that renders them included."""
+    run_and_program = (sorted(asdict(run).items()), program("endo3d_core.virtual_rig"))
+    return hashlib.sha256(repr(run_and_program).encode()).hexdigest()[:32]

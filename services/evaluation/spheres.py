@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from endo3d.services.evaluation import figures_of_merit as merit
 from endo3d.services.evaluation.cache import Cache, Result
 from endo3d.services.evaluation.calibrated import calibrated
-from endo3d.services.evaluation.measure import Progress, clouds, points_of
+from endo3d.services.evaluation.measure import Settings, clouds, points_of
 from endo3d.services.evaluation.report import Report, Table
 from endo3d.services.evaluation.virtual_run import VirtualRun, head_yaml
 from endo3d.services.views.figures import COLOURS, figure
@@ -37,8 +37,9 @@ VARIANTS: dict[str, tuple[str, ...]] = {
 }
 
 
-def evaluate(folder: Path, quick: bool, threads: int, progress: Progress) -> Report:
+def evaluate(settings: Settings) -> Report:
     """Measure, or take what was measured before; tables, plots and figures."""
+    folder, quick = settings.folder, settings.quick
     cache = Cache(folder / f"spheres{'-quick' if quick else ''}.cache.json")
     places = _places(3)
     if quick:
@@ -49,10 +50,10 @@ def evaluate(folder: Path, quick: bool, threads: int, progress: Progress) -> Rep
     for variant in _variants(quick):
         results[variant] = {}
         for place in places if variant == "all effects" else shares:
-            work = partial(_measure, variant, place, 2 if quick else 1, threads)
+            work = partial(_measure, settings, variant, place)
             results[variant][place] = cache.get(f"{variant} {place}", work)
             done += 1
-            progress(done)
+            settings.progress(done)
     return _report(folder, results, quick)
 
 
@@ -75,16 +76,16 @@ def _centre(place: tuple[int, ...]) -> NDArray[np.float64]:
     return np.asarray(middle + np.array(place) * np.array(SPAN_MM) / 2, np.float64)
 
 
-def _measure(variant: str, place: tuple[int, ...], bin_px: int, threads: int) -> Result:
+def _measure(settings: Settings, variant: str, place: tuple[int, ...]) -> Result:
     true = head_yaml(HEAD)
     effects: Effects = FULL.without(*VARIANTS[variant])
     x, y, z = _centre(place)
     run = VirtualRun(
         true, f"sphere r={RADIUS_MM} at={x},{y},{z} surface=metal", "still", PATTERNS, rate_hz=90.0, frames=24,
-        seed=_places(3).index(place), effects=effects, bin_px=bin_px,
+        seed=_places(3).index(place), effects=effects, bin_px=2 if settings.quick else 1,
     )  # fmt: skip
-    known = None if variant == "with exact calibration" else calibrated(true)
-    for cloud, _ in clouds(run, known, threads):
+    known = true if variant == "with exact calibration" else calibrated(true)
+    for cloud, _ in clouds(settings, run, known):
         return merit.sphere(points_of(cloud), np.array((x, y, z)), RADIUS_MM)
     return None
 

@@ -14,12 +14,9 @@ from endo3d.services.cli.app import app
 from endo3d.services.evaluation import cylinder, report, spheres
 from endo3d.services.evaluation.cache import Cache
 from endo3d.services.evaluation.calibrated import calibrated
+from endo3d.services.evaluation.measure import Settings
 from endo3d.services.evaluation.virtual_run import head_yaml
 from endo3d_core.calibration import Rig
-
-
-def ignore(done: int) -> None:
-    """Progress that nobody watches."""
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +27,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.slow
 def test_spheres_in_small(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Size, form and distance come out at the paper's scale, and fibres are named as a source of error."""
-    measured = spheres.evaluate(folder, True, 1, ignore)
+    measured = spheres.evaluate(Settings(folder, quick=True))
     values = [r for r in measured.figures["places"].values() if r is not None]
     assert len(values) == 3
     assert all(abs(r["size_um"]) < 16.0 and 0.05 < r["form_um"] < 8.0 for r in values)
@@ -39,13 +36,13 @@ def test_spheres_in_small(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None
     assert shares["without fibres"] < shares["all effects"]
     # What is measured once is not measured again.
     monkeypatch.setattr(spheres, "_measure", lambda *_: pytest.fail("measured twice"))
-    assert spheres.evaluate(folder, True, 1, ignore).figures == measured.figures
+    assert spheres.evaluate(Settings(folder, quick=True)).figures == measured.figures
 
 
 @pytest.mark.slow
 def test_cylinder_in_small(folder: Path) -> None:
     """Standing, both modes measure; at 2 mm/s only the continuous one does."""
-    results = cylinder.evaluate(folder, True, 1, ignore).figures["results"]
+    results = cylinder.evaluate(Settings(folder, quick=True)).figures["results"]
     for name in ("conventional 0", "continuous 0", "continuous 2"):
         assert results[name][0] is not None
         assert abs(results[name][0]["size_um"]) < 60.0
