@@ -78,8 +78,7 @@ class Viewer(Service[ViewerConfig]):
             case "connect":
                 self._look_at(ViewerSink(self.config.url, scan_blueprint()))
         if self.process is not None:
-            revive = self.process.revive if self.process.page else _leave
-            self._look_at(ViewerSink(self.process.url, scan_blueprint(), revive))
+            self._look_at(ViewerSink(self.process.url, scan_blueprint(), self.process.revive))
 
     def step(self, message: Message) -> Iterator[Message]:
         """Shows a message; yields nothing."""
@@ -108,7 +107,3 @@ class Viewer(Service[ViewerConfig]):
     def _look_at(self, viewer: ViewerSink) -> None:
         self.viewer = viewer
         self.sinks.append(viewer)
-
-
-def _leave() -> None:
-    """Who closes the window wants no other."""

@@ -22,7 +22,8 @@ WINDOW_BYTES = 4 << 20
 PATIENCE_S = 0.05
 """The longest a step waits for a slow viewer."""
 GOODBYE_S = 2.0
-RETRY_NS = 500_000_000
+STALLED_RETRY_NS, GONE_RETRY_NS = 500_000_000, 2_000_000_000
+"""How soon a viewer is asked again, by the messages' own time."""
 APPLICATION, TIMELINE = "endo3d", "time"
 
 
@@ -64,9 +65,10 @@ class ViewerSink:
         self,
         url: str,
         blueprint: rrb.Blueprint,
-        revive: Callable[[], None] = lambda: None,
+        revive: Callable[[], bool] = lambda: True,
         patience_s: float = PATIENCE_S,
     ) -> None:
+        """revive: called when the viewer is gone; says whether it is worth connecting again."""
         self.url = url
         self.patience_s = patience_s
         self.lost = 0
@@ -77,13 +79,15 @@ class ViewerSink:
         self._statics: dict[tuple[str, type], Entry] = {}
         self._under_way = 0
         self._retry_ns = 0
-        self._severed = False
+        self._severed = self._given_up = False
         self._recording = rr.RecordingStream(APPLICATION)
         self._connect()
 
     def log(self, stamp_ns: int, entry: Entry) -> None:
         if entry.static:
             self._statics[entry.path, type(entry.what)] = entry
+        if self._given_up:
+            return
         if self.trouble and not self._recovered(stamp_ns):
             self.lost += 1
             return
@@ -113,11 +117,13 @@ class ViewerSink:
         _log_all(self._recording, (*world(), *self._statics.values()))
 
     def _recovered(self, stamp_ns: int) -> bool:
-        """Looks again now and then, by the messages' own time."""
-        if stamp_ns < self._retry_ns <= stamp_ns + RETRY_NS:
+        """Looks again now and then."""
+        if stamp_ns < self._retry_ns <= stamp_ns + GONE_RETRY_NS:
             return False
         if self._severed:
-            self._revive()
+            if not self._revive():
+                self._given_up, self.trouble = True, ""
+                return False
             self._connect()
         return self._drained(stamp_ns)
 
@@ -129,7 +135,7 @@ class ViewerSink:
             self._severed = "timed out" not in str(error)
             state = "is gone" if self._severed else "doesn't take what it gets"
             self.trouble = f"the Rerun viewer at {self.url} {state}: restart it; nothing waits for it"
-            self._retry_ns = stamp_ns + RETRY_NS
+            self._retry_ns = stamp_ns + (GONE_RETRY_NS if self._severed else STALLED_RETRY_NS)
             return False
         self.trouble, self._severed, self._under_way = "", False, 0
         return True

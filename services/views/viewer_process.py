@@ -15,6 +15,8 @@ from endo3d.services.runtime.errors import UserError
 
 HOST = "127.0.0.1"
 START_S = 15.0
+KEPT_FOR_LATECOMERS = "256MB"
+"""What a browser that comes late is sent at once."""
 
 
 def executable() -> Path:
@@ -49,7 +51,10 @@ class ViewerProcess:
     def __init__(self, port: int = 0, web_port: int | None = None, arguments: tuple[str, ...] = ()) -> None:
         self.port = free_port(port)
         self.web_port = None if web_port is None else free_port(web_port)
-        web = () if self.web_port is None else ("--serve-web", "--web-viewer-port", str(self.web_port))
+        web: tuple[str, ...] = ()
+        if self.web_port is not None:
+            kept = ("--server-memory-limit", KEPT_FOR_LATECOMERS)
+            web = ("--serve-web", "--web-viewer-port", str(self.web_port), *kept)
         self._command = [str(executable()), "--bind", HOST, "--port", str(self.port), *web, *arguments]
         self._process = self._start()
 
@@ -70,10 +75,14 @@ class ViewerProcess:
     def alive(self) -> bool:
         return self._process.poll() is None
 
-    def revive(self) -> None:
-        """Start it again if it ended."""
-        if not self.alive():
-            self._process = self._start()
+    def revive(self) -> bool:
+        """Start the server of a page again if it ended; whoever closed a window wants no other."""
+        if self.alive():
+            return True
+        if not self.page:
+            return False
+        self._process = self._start()
+        return True
 
     def wait(self) -> int:
         """Until it is closed."""

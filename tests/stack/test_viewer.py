@@ -23,7 +23,9 @@ from endo3d.schemas import messages as m
 from endo3d.services.runtime.errors import UserError
 from endo3d.services.viewer import Viewer, ViewerConfig
 from endo3d.services.views import entries
+from endo3d.services.views.blueprint import scan_blueprint
 from endo3d.services.views.display import Display
+from endo3d.services.views.sink import ViewerSink
 from endo3d.services.views.viewer_process import ViewerProcess, free_port
 
 
@@ -184,12 +186,24 @@ def test_a_killed_viewer_is_survived_and_its_page_comes_back() -> None:
     assert not viewer.process.alive()
 
 
+def test_a_closed_window_stays_closed_and_is_no_trouble() -> None:
+    window = ViewerProcess(arguments=("--serve-grpc",))  # stands for a window: no page of its own
+    sink = ViewerSink(window.url, scan_blueprint(), window.revive)
+    window.stop()
+    frames = (message for message in messages(200, 20.0) if isinstance(message, m.Frame))
+    for frame in frames:
+        for entry in entries.frame(frame):
+            sink.log(frame.stamp_ns, entry)
+    assert not window.alive()
+    assert sink.trouble == ""
+    assert 0 < sink.lost < 100
+    sink.close()
+
+
 def test_the_web_viewer_listens_on_loopback_only(rerun_server: ViewerProcess) -> None:
     import psutil
 
-    listening = {
-        c.laddr.ip for c in psutil.Process(rerun_server.pid).net_connections() if c.status == "LISTEN"
-    }
+    listening = {c.laddr.ip for c in psutil.Process(rerun_server.pid).net_connections() if c.status == "LISTEN"}
     assert listening == {"127.0.0.1"}
 
 
