@@ -13,12 +13,14 @@ import numpy as np
 from pydantic import Field
 
 from endo3d.schemas import topics
-from endo3d.schemas.messages import Frame, Message, Mode, Truth
+from endo3d.schemas.messages import Frame, Message, Mode, ServiceState, Status, Truth
 from endo3d.services.archive.reader import Log, Record
 from endo3d.services.runtime.service import Config, Refused, Source
 
 _NEVER_NS = 1 << 63
 EPOCHS_PER_PASS = 1 << 16
+LINGER_NS = 500_000_000
+"""After the last message: it lies in memory of this process, and readers need a moment to take it."""
 
 
 class PlayerConfig(Config):
@@ -33,6 +35,8 @@ class PlayerConfig(Config):
     end_s: float = Field(default=math.inf, gt=0)
     """What part of the log, in seconds from its start."""
     topics: tuple[str, ...] = ("frame", "mode", "calibration/camera", "calibration/projector", "truth")
+    after: tuple[str, ...] = ()
+    """Services that have to be ready before anything is played: a camera would run on, a log would be lost."""
     restamp: bool = True
     """Stamps become the time of playing, so that latencies count from now; else they stay as recorded."""
 
@@ -41,6 +45,8 @@ class Player(Source[PlayerConfig]):
     """Recorded messages again. Each pass through the log and each seek begins a new epoch."""
 
     Config = PlayerConfig
+    reads = (topics.STATUS,)
+    optional = reads
     writes = (topics.CAMERA, topics.PROJECTOR, topics.MODE, topics.FRAME, topics.TRUTH)
     commands: ClassVar[tuple[str, ...]] = ("seek", "rate")
 
@@ -55,6 +61,7 @@ class Player(Source[PlayerConfig]):
             raise ValueError(f"can't play {', '.join(sorted(unknown))}; a camera writes {', '.join(names)}")
         self._topics = [names[name] for name in config.topics]
         self._rate = config.rate
+        self._awaited = set(config.after)
         self._records: Iterator[Record] = iter(())
         self._waiting: Record | None = None
         self._position_s = 0.0
@@ -64,6 +71,7 @@ class Player(Source[PlayerConfig]):
         self._frame_due_ns: int | None = None
         self._next_frame_ns = 0
         """When the frame after the last is due, if it comes a period later: a loop has no gap and no rush."""
+        self._last_ns = 0
         self._passes = -1
         self._next_sequence = 0
         self._sequence_shift: int | None = None
@@ -73,11 +81,19 @@ class Player(Source[PlayerConfig]):
         self._log = Log(self.config.log)
         self._seek(self.config.start_s)
 
+    def step(self, message: Message) -> Iterator[Message]:
+        if isinstance(message, Status) and message.state in (ServiceState.READY, ServiceState.RUNNING):
+            self._awaited.discard(message.service)
+        yield from ()
+
     def poll(self, timeout_s: float) -> Iterator[Message]:
+        if self._awaited:
+            self.wait(timeout_s)
+            return
         if self._waiting is None:
             self._waiting = next(self._records, None)
         if self._waiting is None:
-            self._at_end()
+            self._at_end(timeout_s)
             return
         now_ns = self.now_ns()
         due_ns = self._due_ns(self._waiting, now_ns)
@@ -89,9 +105,7 @@ class Player(Source[PlayerConfig]):
         record, self._waiting = self._waiting, None
         yield self._again(record, due_ns)
 
-    def command(
-        self, verb: str, parameters: Mapping[str, Any], now_ns: int
-    ) -> Iterator[Message | Mapping[str, Any]]:
+    def command(self, verb: str, parameters: Mapping[str, Any], now_ns: int) -> Iterator[Message | Mapping[str, Any]]:
         match verb:
             case "seek":
                 self._seek(_number(parameters, "s"))
@@ -124,11 +138,13 @@ class Player(Source[PlayerConfig]):
         self._passes += 1
         self._sequence_shift = None
 
-    def _at_end(self) -> None:
+    def _at_end(self, timeout_s: float) -> None:
         if self.config.loop and self._played:
             next_ns = self._next_frame_ns
             self._seek(self.config.start_s)
             self._next_frame_ns = next_ns
+        elif self.now_ns() < self._last_ns + LINGER_NS:
+            self.wait(timeout_s)
         else:
             self.finished = True
 
@@ -147,15 +163,14 @@ class Player(Source[PlayerConfig]):
         """The recorded message as a camera would give it now."""
         message = record.message()
         self._played = True
+        self._last_ns = due_ns
         self._position_s = (record.log_ns - self._log.start_ns) * 1e-9
         if self.config.restamp:
             message = replace(message, stamp_ns=due_ns)
         later_ns = message.stamp_ns - record.publish_ns
         match message:
             case Mode():
-                return replace(
-                    message, epoch=self._epoch(message.epoch), start_ns=message.start_ns + later_ns
-                )
+                return replace(message, epoch=self._epoch(message.epoch), start_ns=message.start_ns + later_ns)
             case Truth():
                 return replace(message, sequence=self._sequence(message.sequence))
             case Frame():

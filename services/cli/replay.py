@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
+import tempfile
 import time
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 
@@ -24,18 +25,19 @@ if TYPE_CHECKING:
 def replay(
     log: Annotated[Path, typer.Argument(help="The log (.mcap).")],
     out: Annotated[Path | None, typer.Option("--out", help="Write the results into a new log.")] = None,
-    stack: Annotated[
-        str | None, typer.Option("--stack", help="Another stack file than the log's own.")
-    ] = None,
+    stack: Annotated[str | None, typer.Option("--stack", help="Another stack file than the log's own.")] = None,
     overrides: SetOption = None,
-    only: Annotated[
-        list[str] | None, typer.Option("--only", help="Run only this service; repeatable.")
-    ] = None,
+    only: Annotated[list[str] | None, typer.Option("--only", help="Run only this service; repeatable.")] = None,
     topic: Annotated[
         list[str] | None, typer.Option("--topic", help="Feed only this topic of the log; repeatable.")
     ] = None,
     from_s: Annotated[float, typer.Option("--from", help="Start, in seconds into the log.")] = 0.0,
     to_s: Annotated[float, typer.Option("--to", help="End, in seconds into the log.")] = float("inf"),
+    rate: Annotated[
+        float | None,
+        typer.Option("--rate", help="Play through the live stack instead, at so many times the recorded pace."),
+    ] = None,
+    loop: Annotated[bool, typer.Option("--loop", help="Start over at the end; with --rate.")] = False,
     digest: Annotated[
         bool, typer.Option("--digest", help="Hash the results: equal replays have equal digests.")
     ] = False,
@@ -45,7 +47,10 @@ def replay(
 
     The stack file and the calibration are those in the log. Equal input and configuration give equal bits.
 
-    Examples: endo3d replay scan.mcap --digest; endo3d replay scan.mcap --set decoder.grid=2 --out again.mcap
+    With --rate the log takes the camera's place in the running stack, with every process and viewer.
+
+    Examples: endo3d replay scan.mcap --digest; endo3d replay scan.mcap --set decoder.bin_px=2 --out fine.mcap;
+    endo3d replay scan.mcap --rate 1 --loop
     """
     from endo3d.schemas import topics
     from endo3d.services.archive.reader import Log
@@ -55,6 +60,11 @@ def replay(
     recorded = Log(log)
     if unknown := set(topic or ()) - topics.BY_NAME.keys():
         raise UserError(f"no topic {', '.join(sorted(unknown))}; there are {', '.join(topics.BY_NAME)}")
+    if loop and rate is None:
+        raise UserError("--loop repeats a live replay; add --rate 1")
+    if rate is not None:
+        with engine.stack_of(recorded, stack, overrides or ()) as described:
+            _live(engine.live_stack(described, log, rate=rate, loop=loop, start_s=from_s, end_s=to_s, out=out))
     start_ns = recorded.start_ns + round(from_s * 1e9)
     end_ns = min(recorded.end_ns + 1, recorded.start_ns + round(min(to_s, 1e9) * 1e9))
     digests = engine.Digest() if digest else None
@@ -87,6 +97,17 @@ def replay(
         "files": [str(part) for part in into.parts] if into is not None else [],
     }
     print(json.dumps(report, indent=2) if as_json else _text(report))
+
+
+def _live(stack_toml: str) -> NoReturn:
+    """The stack, started; ends with the log, or Ctrl-C."""
+    from endo3d.services.cli.up import up
+
+    with tempfile.TemporaryDirectory(prefix="endo3d-") as folder:
+        path = Path(folder) / "replay.toml"
+        path.write_text(stack_toml, encoding="utf-8")
+        up(str(path))
+    raise typer.Exit
 
 
 @contextmanager

@@ -6,6 +6,7 @@ import hashlib
 import tempfile
 from collections import Counter, deque
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -26,6 +27,9 @@ from endo3d.services.runtime.stack_file import Stack
 
 CARRIED = frozenset({topics.MODE, topics.CAMERA, topics.PROJECTOR, topics.TRUTH})
 """What a log of results takes over from the log they were made of."""
+
+AHEAD = 16
+"""Records read ahead of the one being computed."""
 
 
 class Result(NamedTuple):
@@ -106,6 +110,35 @@ def pipeline_of(stack: Stack, only: Collection[str] = ()) -> Iterator[Pipeline]:
         yield Pipeline(services)
 
 
+def live_stack(
+    stack: Stack, log: Path, *, rate: float, loop: bool, start_s: float, end_s: float, out: Path | None
+) -> str:
+    """The stack file in which a player with the log stands in for the camera and the projector.
+
+    What was recorded then is not recorded again, unless into ``out``.
+    """
+    tables: dict[str, Mapping[str, Any]] = {
+        "rig": stack.rig.model_dump(exclude_none=True),
+        "player": {},
+    }
+    played = {topics.FRAME, *CARRIED}
+    for name, table in stack.tables.items():
+        kind = stack.kind(name)
+        if not played.intersection(kind.writes) and not issubclass(kind, Tap):
+            tables[name] = table
+    if out is not None:
+        tables["recorder"] = {"directory": str(out.resolve().parent), "name": out.stem}
+    tables["player"] = {
+        "log": str(log.resolve()),
+        "rate": rate,
+        "loop": loop,
+        "start_s": start_s,
+        "end_s": end_s,
+        "after": [name for name in tables if name not in ("rig", "player")],
+    }
+    return stack_file.to_toml(tables)
+
+
 class Digest:
     """One SHA-256 per topic over the encoded messages: equal replays have equal digests."""
 
@@ -127,9 +160,7 @@ def recording_of(path: Path, log: Log, stack: Stack) -> Recording:
     attachments = [Attachment(STACK_FILE, "application/toml", stack.toml.encode())]
     if (calibration := log.attachments.get(CALIBRATION_FILE)) is not None:
         attachments.append(Attachment(CALIBRATION_FILE, "application/yaml", calibration))
-    return Recording(
-        path, {**host_facts(), "rig": stack.rig.name, "replayed_from": log.path.name}, attachments
-    )
+    return Recording(path, {**host_facts(), "rig": stack.rig.name, "replayed_from": log.path.name}, attachments)
 
 
 def replay(
@@ -149,7 +180,7 @@ def replay(
     """
     wanted = frozenset(inputs) or pipeline.inputs
     kept = {topic for topic in CARRIED if topic not in pipeline.written} if into is not None else set()
-    for record in log.records(wanted | kept, start_ns=start_ns, end_ns=end_ns):
+    for record in _read_ahead(log.records(wanted | kept, start_ns=start_ns, end_ns=end_ns)):
         topic = record.stream.topic
         if into is not None and topic in kept:
             into.put(_entry(topic, "", record.sequence, record.log_ns, record.publish_ns, record.payload))
@@ -159,6 +190,15 @@ def replay(
             if into is not None or digest is not None:
                 _keep(Result(service, message, record), into, digest)
             yield Result(service, message, record)
+
+
+def _read_ahead(records: Iterator[Record]) -> Iterator[Record]:
+    """The same records; another thread meanwhile reads and checks the next ones."""
+    with ThreadPoolExecutor(1, thread_name_prefix="read-ahead") as reader:
+        coming = deque(reader.submit(next, records, None) for _ in range(AHEAD))
+        while (record := coming.popleft().result()) is not None:
+            coming.append(reader.submit(next, records, None))
+            yield record
 
 
 def _keep(result: Result, into: Recording | None, digest: Digest | None) -> None:
@@ -172,9 +212,7 @@ def _keep(result: Result, into: Recording | None, digest: Digest | None) -> None
         into.put(_entry(topic, result.service, sequence, cause.log_ns, message.stamp_ns, memoryview(encoded)))
 
 
-def _entry(
-    topic: Topic, source: str, sequence: int, log_ns: int, stamp_ns: int, payload: memoryview
-) -> Entry:
+def _entry(topic: Topic, source: str, sequence: int, log_ns: int, stamp_ns: int, payload: memoryview) -> Entry:
     return Entry(
         channel=topic.channel(source),
         kind=Kind(*codec.schema(topic)),

@@ -50,9 +50,7 @@ def projector() -> m.ProjectorCalibration:
 
 
 def mode(epoch: int = 1) -> m.Mode:
-    return m.Mode(
-        START_NS, "interleaved", "interleaved f1=25", epoch, START_NS + 1_000, PERIOD_NS, 5000.0, True
-    )
+    return m.Mode(START_NS, "interleaved", "interleaved f1=25", epoch, START_NS + 1_000, PERIOD_NS, 5000.0, True)
 
 
 def sample(message: m.Message, received_ns: int | None = None, source: str = "") -> Sample:

@@ -29,9 +29,7 @@ from endo3d.services.runtime.service import Refused, Sample
 
 
 def recorder(directory: Path, **config: Any) -> Recorder:
-    made = Recorder(
-        RecorderConfig(directory=directory, name="log", **{"floor_mb": 0, "reserve_mb": 0} | config)
-    )
+    made = Recorder(RecorderConfig(directory=directory, name="log", **{"floor_mb": 0, "reserve_mb": 0} | config))
     made.open()
     return made
 
@@ -158,9 +156,7 @@ def test_what_is_malformed_is_counted_and_what_was_reclaimed_too(tmp_path: Path)
 
 
 @given(
-    image=st.tuples(
-        st.integers(1, 40), st.integers(1, 40), st.sampled_from((np.uint8, np.uint16)), st.integers()
-    ),
+    image=st.tuples(st.integers(1, 40), st.integers(1, 40), st.sampled_from((np.uint8, np.uint16)), st.integers()),
     smooth=st.booleans(),
 )
 def test_compact_is_lossless(tmp_path: Path, image: tuple[int, int, type, int], smooth: bool) -> None:

@@ -50,9 +50,7 @@ def surviving(whole: Path, cut: int) -> list[tuple[str, int, int, int, bytes]]:
     found = []
     for chunk in kept:
         for record in log._in_chunk(chunk, log.streams, check=True):
-            found.append(
-                (record.stream.name, record.sequence, record.log_ns, record.publish_ns, bytes(record.payload))
-            )
+            found.append((record.stream.name, record.sequence, record.log_ns, record.publish_ns, bytes(record.payload)))
     return sorted(found, key=lambda item: item[2])
 
 

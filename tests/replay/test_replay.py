@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -130,3 +133,23 @@ def test_a_log_without_a_stack_needs_one(tmp_path: Path) -> None:
     path = record(tmp_path / "log.mcap", scan(1))
     with pytest.raises(UserError, match="name one with --stack"):
         run(path)
+
+
+@pytest.mark.slow
+def test_the_live_stack_computes_the_same_bits(log: Path, tmp_path: Path) -> None:
+    """Processes, shared memory and a clock in between change nothing of the points."""
+    out = tmp_path / "live.mcap"
+    rig = f"rig.name=replay{os.getpid()}"
+    command = [sys.executable, "-m", "endo3d.services.cli.app", "replay", str(log), "--rate", "0.1"]
+    done = subprocess.run([*command, "--set", rig, "--out", str(out)], capture_output=True, text=True, timeout=100)
+    assert done.returncode == 0, done.stderr
+    live = Log(out)
+    assert live.count(topics.FRAME) == live.count(topics.TRUTH) == FRAMES
+    clouds = {m.sequence: m for m in live.messages(topics.CLOUD) if isinstance(m, Cloud)}
+    recorded = Log(log)
+    with engine.stack_of(recorded) as stack, engine.pipeline_of(stack, ["decoder"]) as pipeline:
+        for result in engine.replay(recorded, pipeline):
+            if isinstance(result.message, Cloud) and result.message.sequence in clouds:
+                assert clouds.pop(result.message.sequence).points.tobytes() == result.message.points.tobytes()
+    assert not clouds
+    assert live.count(topics.CLOUD) > 0
