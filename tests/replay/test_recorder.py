@@ -22,6 +22,7 @@ from recorded import START_NS, YAML, frame, mode, pose, projector, record, same,
 
 from endo3d.schemas import codec, topics
 from endo3d.schemas.messages import Frame, Level, LogLine
+from endo3d.services.archive.compact import Packer, unpack
 from endo3d.services.archive.crop import Crop
 from endo3d.services.archive.reader import Log
 from endo3d.services.recorder import Recorder, RecorderConfig
@@ -156,22 +157,30 @@ def test_what_is_malformed_is_counted_and_what_was_reclaimed_too(tmp_path: Path)
 
 
 @given(
-    image=st.tuples(st.integers(1, 40), st.integers(1, 40), st.sampled_from((np.uint8, np.uint16)), st.integers()),
+    shape=st.tuples(st.integers(1, 40), st.integers(1, 40)),
+    kind=st.sampled_from((np.uint8, np.uint16)),
+    seed=st.integers(0, 1000),
     smooth=st.booleans(),
 )
-def test_compact_is_lossless(tmp_path: Path, image: tuple[int, int, type, int], smooth: bool) -> None:
-    rows, columns, kind, seed = image
-    rng = np.random.default_rng(abs(seed))
-    pixels = rng.integers(0, np.iinfo(kind).max + 1, (rows, columns), kind)
+def test_packing_is_lossless(
+    shape: tuple[int, int], kind: type[np.unsignedinteger[Any]], seed: int, smooth: bool
+) -> None:
+    pixels = np.random.default_rng(seed).integers(0, np.iinfo(kind).max + 1, shape, kind)
     if smooth:
         pixels = np.sort(pixels, axis=0)
-    sent = replace(frame(0), image=pixels)
-    service = recorder(tmp_path, compact=True)
-    list(service.take(sample(sent)))
-    files = command(service, "stop")["files"]
-    service.close()
-    (got,) = Log(files[0]).messages(topics.FRAME)
-    assert same(got, sent)
+    sent = codec.encode(replace(frame(0), image=pixels))
+    head, packed = Packer()(memoryview(sent))
+    assert bytes(unpack(memoryview(head + packed))) == sent
+
+
+@given(st.binary(max_size=200))
+def test_what_is_not_packed_is_malformed(junk: bytes) -> None:
+    with pytest.raises(codec.Malformed):
+        unpack(memoryview(junk))
+    sent = codec.encode(replace(frame(0), image=np.zeros((3, 4), np.uint8)))
+    head, _ = Packer()(memoryview(sent))
+    with pytest.raises(codec.Malformed):
+        unpack(memoryview(head + junk))
 
 
 def test_compact_halves_what_is_smooth(tmp_path: Path) -> None:
