@@ -27,8 +27,8 @@ MOTION = "hand seed=7 reach=5 speed=3"
 PATTERNS = "interleaved f1=15"
 RATE_HZ = 172.0
 DURATION_S = 26.0
-SHARE_DURATION_S = 8.0
-"""Once along the standard and back."""
+SHARE_FIRST, SHARE_FRAMES = 740, 688
+"""The shares are of these 4 s of the scan: from its middle to one end and back, all features in view."""
 QUICK_S = 0.5
 MERGING_UM = 75.0
 BIN_PX = 2
@@ -60,11 +60,7 @@ RENDERED = ("without fibres", "without noise", "without motion blur")
 
 def steps(quick: bool) -> int:
     """Frames in all."""
-    return _frames(QUICK_S) if quick else _frames(DURATION_S) + len(RENDERED) * _frames(SHARE_DURATION_S)
-
-
-def _frames(seconds: float) -> int:
-    return round(seconds * RATE_HZ)
+    return round(RATE_HZ * QUICK_S) if quick else round(RATE_HZ * DURATION_S) + len(RENDERED) * SHARE_FRAMES
 
 
 def evaluate(settings: Settings) -> Report:
@@ -78,47 +74,57 @@ def evaluate(settings: Settings) -> Report:
     if not settings.quick:
         shares |= result["shares"]
         for k, variant in enumerate(RENDERED):
-            before = _frames(DURATION_S) + k * _frames(SHARE_DURATION_S)
+            before = round(RATE_HZ * DURATION_S) + k * SHARE_FRAMES
             shares[variant] = cache.get(variant, partial(_variant, settings, variant, before))
         shares = {variant: shares[variant] for variant in VARIANTS}
     return _report(settings.folder, name, seconds, result, shares, kept)
 
 
-def _run(variant: str, seconds: float) -> VirtualRun:
-    effects = FULL.without(*VARIANTS[variant])
-    frames = _frames(seconds)
-    return VirtualRun(head_yaml(HEAD), SCENE, MOTION, PATTERNS, RATE_HZ, frames, effects=effects, bin_px=BIN_PX)
+def _run(variant: str, frames: int, first: int = 0) -> VirtualRun:
+    return VirtualRun(
+        head_yaml(HEAD),
+        SCENE,
+        MOTION,
+        PATTERNS,
+        RATE_HZ,
+        frames,
+        effects=FULL.without(*VARIANTS[variant]),
+        bin_px=BIN_PX,
+        begin_s=first / RATE_HZ,
+    )
 
 
 def _scan(settings: Settings, seconds: float, kept: Path) -> Result:
-    """The whole scan; beside it, as long as the shares last, with exact calibration and with true poses."""
-    run, true = _run("all effects", seconds), head_yaml(HEAD)
+    """The whole scan; beside it a part of it anew, also with exact calibration and with true poses."""
+    run, true = _run("all effects", round(RATE_HZ * seconds)), head_yaml(HEAD)
     decoding, exact = Clouds(run, calibrated(true)), Clouds(run, true)
-    hand, exact_hand = Merging(MERGING_UM), Merging(MERGING_UM)
-    placed = Merging(MERGING_UM, true_poses=True)
-    shares: dict[str, Result] = {}
-    share_frames = 0 if settings.quick else _frames(SHARE_DURATION_S)
-    for done, (frame, truth) in enumerate(settings.shots(run), start=1):
+    hand, part, placed, exact_part = (Merging(MERGING_UM, true_poses=k == 2) for k in range(4))
+    for frame, truth in settings.shots(run):
+        in_part = SHARE_FIRST <= frame.sequence < SHARE_FIRST + SHARE_FRAMES
         for cloud, where in decoding.of(frame, truth):
             hand.add(cloud, where)
-            if done <= share_frames:
+            if in_part:
+                part.add(cloud, where)
                 placed.add(cloud, where)
-        if done <= share_frames:
+        if in_part:
             for cloud, where in exact.of(frame, truth):
-                exact_hand.add(cloud, where)
-        if done == share_frames:
-            shares["all effects"] = _outcome(hand)
-            shares["with exact calibration"] = _outcome(exact_hand)
-            shares["with true poses"] = _outcome(placed)
-        settings.progress(done)
+                exact_part.add(cloud, where)
+        settings.progress(frame.sequence + 1)
     found = hand.map(AT_LEAST)
     np.savez(kept, points=found.points.astype(np.float32), path=found.estimated[:, :3, 3])
+    if settings.quick:
+        return _outcome(hand)
+    shares = {
+        "all effects": _outcome(part),
+        "with exact calibration": _outcome(exact_part),
+        "with true poses": _outcome(placed),
+    }
     return {**_outcome(hand), "shares": shares}
 
 
 def _variant(settings: Settings, variant: str, before: int) -> Result:
-    """The first seconds again, with frames that lack an effect."""
-    run = _run(variant, SHARE_DURATION_S)
+    """That part with frames that lack an effect."""
+    run = _run(variant, SHARE_FRAMES, SHARE_FIRST)
     decoding, hand = Clouds(run, calibrated(head_yaml(HEAD))), Merging(MERGING_UM)
     for done, (frame, truth) in enumerate(settings.shots(run), start=1):
         for cloud, where in decoding.of(frame, truth):
@@ -228,7 +234,7 @@ def _report(
             f"`{SCENE}` scanned along its profile, motion `{MOTION}` (seeded: drift of about 3 mm/s, tremor of "
             f"50 to 100 um at 8 to 12 Hz), {RATE_HZ:g} Hz, `{PATTERNS}`, head {HEAD}, camera binned to 960x600, "
             f"merging distance {MERGING_UM:g} um, map points with {AT_LEAST} observations or more. "
-            f"The shares are of the first {SHARE_DURATION_S:g} s: once along the standard and back.",
+            f"The shares are of {SHARE_FRAMES / RATE_HZ:.0f} s of it, begun anew: from the middle to one end and back.",
         ],
         tables,
         [f"{name}.png"],
@@ -246,7 +252,7 @@ def _share_table(shares: dict[str, Result]) -> Table:
             cells.append("not seen" if ours is None else f"{ours['value'] - reference:+.{2 if unit == 'deg' else 1}f}")
         rows.append((variant, *cells, f"{result['odometry']['ate_um']:.1f}" if result else ""))
     columns = ("deviation", *(f"{feature} / {PAPER[feature][3]}" for feature in PAPER), "trajectory / um")
-    return Table(f"Shares of the error, {SHARE_DURATION_S:g} s", columns, rows)
+    return Table(f"Shares of the error, {SHARE_FRAMES / RATE_HZ:.0f} s", columns, rows)
 
 
 def _plot(path: Path, scan: Path) -> None:
