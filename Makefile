@@ -4,7 +4,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 INSTALLED := .venv/installed
 
-.PHONY: help demo test check bench faults soak wheel clean
+.PHONY: help demo test check bench wheel clean
 
 help:
 	@echo "make demo     scan the micro-contour standard on the virtual rig"

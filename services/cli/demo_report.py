@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Iterator
 from dataclasses import asdict
 from itertools import chain
@@ -96,7 +97,7 @@ def show(report: dict[str, Any]) -> None:
         table.add_row("restarted", ", ".join(f"{name} {count}x" for name, count in report["restarts"].items()))
     console = Console()
     console.print(table)
-    console.print(f"Look at it: [bold]endo3d view {report['files']['log']}[/]")
+    console.print(f"Look at it: [bold]{sys.argv[0]} view {report['files']['log']}[/]", soft_wrap=True)
 
 
 def _lost(lost: dict[str, dict[str, int]]) -> str:
