@@ -13,7 +13,7 @@ from endo3d.services.views import entries
 from endo3d.services.views.blueprint import BEFORE_ANY_MAP, Stand
 from endo3d.services.views.colouring import colouring
 from endo3d.services.views.entries import Entry
-from endo3d.services.views.merged import MergedMap
+from endo3d.services.views.merged import MergedMap, starts_afresh
 from endo3d.services.views.principal import principal
 from endo3d.services.views.scan import xyz
 from endo3d.services.views.splat import looking, oblique
@@ -67,6 +67,9 @@ class Display:
                 yield from self._pose(message)
             case m.MapDelta():
                 self.merged.add(message)
+                if starts_afresh(message):
+                    self.way.clear()
+                    yield from entries.nothing(entries.MAP, entries.WAY)
                 if self._due("map", message.stamp_ns):
                     yield from self.map_now()
             case m.CameraCalibration():

@@ -138,6 +138,12 @@ def way(positions: NDArray[np.floating]) -> Iterator[Entry]:
     yield Entry(WAY, strip, positions.nbytes)
 
 
+def nothing(*paths: str) -> Iterator[Entry]:
+    """What was shown there goes."""
+    for path in paths:
+        yield Entry(path, rr.Clear(recursive=False))
+
+
 def status(message: m.Status) -> Iterator[Entry]:
     """Rate and latency of one service."""
     yield Entry(f"{PLOTS}/rate_hz/{message.service}", rr.Scalars(message.rate_hz))

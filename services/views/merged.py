@@ -10,6 +10,11 @@ from numpy.typing import NDArray
 from endo3d.schemas.messages import MapDelta
 
 
+def starts_afresh(delta: MapDelta) -> bool:
+    """Whether the map was reset, and with it the world: poses before belong to another one."""
+    return delta.reset and not len(delta.points)
+
+
 class MergedMap:
     """Keeps the newest point of every voxel; sorts only when asked for the points."""
 

@@ -25,7 +25,7 @@ from endo3d.schemas.messages import (
     Truth,
 )
 from endo3d.services.archive.reader import Log
-from endo3d.services.views.merged import MergedMap
+from endo3d.services.views.merged import MergedMap, starts_afresh
 
 SECOND_NS = 1_000_000_000
 KEEP_GROWTH = 1.25
@@ -66,6 +66,8 @@ class Scan:
                 self.working_distance_mm = float(np.median(self.single["z"]))
             case MapDelta():
                 self.merged.add(message)
+                if starts_afresh(message):
+                    self.poses.clear()
             case Pose():
                 self.poses.append(message)
             case Truth():

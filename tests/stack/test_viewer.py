@@ -74,6 +74,20 @@ def test_a_lost_pose_moves_nothing() -> None:
     assert list(Display().show(pose))
 
 
+def test_a_reset_clears_map_and_way_and_a_snapshot_does_not() -> None:
+    display = Display()
+    for message in messages():
+        list(display.show(message))
+    (*_, delta) = only(m.MapDelta, 6)
+    snapshot = replace(delta, stamp_ns=delta.stamp_ns + 1, reset=True)
+    assert {entry.path for entry in display.show(snapshot)} <= {entries.MAP}
+    assert display.way
+    reset = replace(snapshot, points=delta.points[:0])
+    assert {entry.path for entry in display.show(reset)} == {entries.MAP, entries.WAY}
+    assert not display.way
+    assert list(display.map_now()) == []
+
+
 def test_every_message_of_a_scan_can_be_shown() -> None:
     display = Display()
     paths = {entry.path for message in messages() for entry in display.show(message)}
