@@ -87,16 +87,17 @@ def evaluate(settings: Settings) -> Report:
     return _report(folder, name, results, shares)
 
 
-def _measure(settings: Settings, variant: str, mode: str, speed_mm_s: float, k: int) -> Result:
-    """One repetition: the standard is put down anew, the stage passes the middle at half time."""
+def _run(variant: str, mode: str, speed_mm_s: float, k: int) -> tuple[VirtualRun, float]:
+    """One repetition, and where the cylinder's crest is: the standard is put down anew each time.
+
+    The stage passes the middle at half time.
+    """
     rng = np.random.default_rng((k, int(10 * speed_mm_s)))
-    dx, dy = rng.uniform(-0.2, 0.2, 2)
-    x_mm = dx
+    x_mm, y_mm = rng.uniform(-0.2, 0.2, 2)
     begin = -speed_mm_s * FRAMES / RATE_HZ / 2
-    true = head_yaml(HEAD)
     run = VirtualRun(
-        true,
-        f"contour at={x_mm - standard.LARGE_CYLINDER_X_MM},{dy},20 surface=metal texture=noise:0.15:0.15",
+        head_yaml(HEAD),
+        f"contour at={x_mm - standard.LARGE_CYLINDER_X_MM},{y_mm},20 surface=metal texture=noise:0.15:0.15",
         f"stage v={speed_mm_s} along=x start={begin},0,0" if speed_mm_s > 0.0 else "still",
         MODES[mode],
         RATE_HZ,
@@ -105,6 +106,12 @@ def _measure(settings: Settings, variant: str, mode: str, speed_mm_s: float, k: 
         effects=FULL.without(*SHARES[variant]),
         bin_px=BIN_PX,
     )
+    return run, float(x_mm)
+
+
+def _measure(settings: Settings, variant: str, mode: str, speed_mm_s: float, k: int) -> Result:
+    run, x_mm = _run(variant, mode, speed_mm_s, k)
+    true = head_yaml(HEAD)
     known = true if variant == "with exact calibration" else calibrated(true)
     measured = list(clouds(settings, run, known))
     if not measured:
@@ -140,8 +147,8 @@ def _report(
         "Moving cylinder, both modes (paper: figs. 9 and 10)",
         [
             f"The contour standard (metal, 15 % texture) passes on a stage, {FRAMES} patterns at {RATE_HZ:g} Hz. "
-            f"Head {HEAD}, camera binned to 960x600; conventional `{MODES['conventional']}`, continuous `{MODES['continuous']}`, whose clouds "
-            f"are registered and merged at {MERGING_UM:g} um. {len(next(iter(results.values())))} repetitions, "
+            f"Head {HEAD}, camera binned to 960x600; conventional `{MODES['conventional']}`, continuous "
+            f"`{MODES['continuous']}`, whose clouds are registered and merged at {MERGING_UM:g} um. {len(next(iter(results.values())))} repetitions, "
             "each with the standard put down anew and its own noise. Slopes up to 60 degrees, 0.3 % of the points "
             "left out; a fit that is off by more than 0.1 mm counts as no measurement. Goal: continuous within "
             "+-10 um at 0 to 2 mm/s, valid at 10 mm/s.",

@@ -8,14 +8,13 @@ from collections.abc import Callable, Iterator
 from dataclasses import asdict
 from pathlib import Path
 
-from endo3d.schemas import codec, topics
-from endo3d.schemas.messages import Frame, Message, ProjectorCalibration, Truth
-from endo3d.services.archive.entry import CALIBRATION_FILE, Attachment, Entry
+from endo3d.schemas import topics
+from endo3d.schemas.messages import Frame, Truth
+from endo3d.services.archive.entry import entry_of
 from endo3d.services.archive.facts import host_facts
 from endo3d.services.archive.reader import Log, Unreadable
 from endo3d.services.archive.recording import Recording
 from endo3d.services.archive.recover import recover
-from endo3d.services.archive.writer import Kind
 from endo3d.services.evaluation.cache import program
 from endo3d.services.evaluation.virtual_run import VirtualRun
 from endo3d.services.runtime.errors import UserError
@@ -39,7 +38,7 @@ def prerender(run: VirtualRun, path: Path, threads: int, progress: Callable[[int
     done = 0
     try:
         for message in (*run.calibration(), run.mode()):
-            recording.put(_entry(message))
+            recording.put(entry_of(message))
         if kept.exists():
             for frame, truth in frames_of(kept):
                 _put(recording, frame, truth)
@@ -58,8 +57,8 @@ def prerender(run: VirtualRun, path: Path, threads: int, progress: Callable[[int
 
 
 def _put(recording: Recording, frame: Frame, truth: Truth) -> None:
-    recording.put(_entry(truth))
-    recording.put(_entry(frame))
+    recording.put(entry_of(truth))
+    recording.put(entry_of(frame))
 
 
 def _keep(unfinished: Path, kept: Path, run: VirtualRun) -> None:
@@ -86,23 +85,6 @@ def frames_of(log: Path) -> Iterator[tuple[Frame, Truth]]:
         if message.sequence != expected or expected not in truths:
             return
         yield message, truths[expected]
-
-
-def _entry(message: Message) -> Entry:
-    topic = topics.of(message)
-    attachment = None
-    if isinstance(message, ProjectorCalibration):
-        attachment = Attachment(CALIBRATION_FILE, "application/yaml", message.yaml.encode())
-    return Entry(
-        channel=topic.channel(),
-        kind=Kind(*codec.schema(topic)),
-        sequence=getattr(message, "sequence", 0),
-        log_ns=message.stamp_ns,
-        publish_ns=message.stamp_ns,
-        payload=(codec.encode(message),),
-        latched=topic.latched,
-        attachment=attachment,
-    )
 
 
 def name(run: VirtualRun) -> str:
