@@ -7,6 +7,7 @@ import socket
 import struct
 from collections import defaultdict
 from collections.abc import Iterator
+from contextlib import suppress
 
 import pytest
 import zenoh
@@ -23,10 +24,10 @@ store = get_typestore(Stores.ROS2_JAZZY)
 class Ros:
     """A router with a listener that takes everything of a domain, and its graph."""
 
-    def __init__(self, domain: int) -> None:
+    def __init__(self, domain: int, endpoint: str = "") -> None:
         with socket.socket() as probe:
             probe.bind(("127.0.0.1", 0))
-            self.endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+            self.endpoint = endpoint or f"tcp/127.0.0.1:{probe.getsockname()[1]}"
         config = zenoh.Config()
         config.insert_json5("mode", '"router"')
         config.insert_json5("listen/endpoints", f'["{self.endpoint}"]')
@@ -126,6 +127,24 @@ def test_images_are_thinned_and_poses_are_not(ros: Ros) -> None:
     taken = ros.take(10 + 50)
     bridge.close()
     assert sorted(map(len, taken.values())) == [10, 50]
+
+
+def test_a_restarted_router_is_found_again(ros: Ros, bridge: Ros2Bridge) -> None:
+    first = list(messages(1))
+    for message in first:
+        list(bridge.step(message))
+    ros.take(7)
+    ros.session.close()
+    again = Ros(7, ros.endpoint)
+    for message in messages(2000, hz=50.0, start_s=1.0):
+        list(bridge.step(message))
+        with suppress(queue.Empty):
+            again.samples.get(timeout=0.02)
+            break
+    else:
+        pytest.fail("nothing came any more")
+    assert again.tokens.get(timeout=20).kind == zenoh.SampleKind.PUT
+    again.session.close()
 
 
 def test_without_a_router_it_says_what_to_start() -> None:
