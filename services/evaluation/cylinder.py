@@ -150,8 +150,8 @@ def _report(
             f"Head {HEAD}, camera binned to 960x600; conventional `{MODES['conventional']}`, continuous "
             f"`{MODES['continuous']}`, whose clouds are registered and merged at {MERGING_UM:g} um. "
             f"{len(next(iter(results.values())))} repetitions, each with the standard put down anew and its own noise. "
-            "Slopes up to 60 degrees, 0.3 % of the points left out; a fit that is off by more than 0.1 mm counts as no measurement. Goal: continuous within "
-            "+-10 um at 0 to 2 mm/s, valid at 10 mm/s.",
+            "Slopes up to 60 degrees, 0.3 % of the points left out; a fit that is off by more than 0.1 mm counts as "
+            "no measurement. Goal: continuous within +-10 um at 0 to 2 mm/s, valid at 10 mm/s.",
         ],
         tables,
         [f"{name}.png"],
