@@ -40,6 +40,7 @@ bench: $(INSTALLED)
 	$(BIN)/python -m bench.run $(ARGS)
 
 wheel: $(INSTALLED)
+	@rm -rf build/lib  # a module that is gone would still get into the wheel
 	$(BIN)/python -m pip wheel --quiet --no-deps --wheel-dir dist .
 
 clean:
