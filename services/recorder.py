@@ -15,10 +15,10 @@ from typing import Any, ClassVar
 from pydantic import Field
 
 from endo3d.schemas import codec, topics
-from endo3d.schemas.messages import Frame, Message, ProjectorCalibration
+from endo3d.schemas.messages import Frame, Message
 from endo3d.schemas.topics import Topic
 from endo3d.services.archive.crop import Crop
-from endo3d.services.archive.entry import CALIBRATION_FILE, COMPACT_IMAGE, STACK_FILE, Attachment, Entry
+from endo3d.services.archive.entry import COMPACT_IMAGE, STACK_FILE, Attachment, Entry, calibration_of
 from endo3d.services.archive.facts import host_facts
 from endo3d.services.archive.layout import Buffer
 from endo3d.services.archive.reader import Unreadable
@@ -75,9 +75,7 @@ class Recorder(Tap[RecorderConfig]):
             known = ", ".join(topics.BY_NAME)
             raise ValueError(f"log_hz: no topic {', '.join(sorted(unknown))}; known are {known}")
         self._kinds = {topic.name: Kind(*codec.schema(topic)) for topic in self.reads}
-        self._period_ns = {
-            topic.name: _period_ns(config.log_hz.get(topic.name, topic.log_hz)) for topic in self.reads
-        }
+        self._period_ns = {topic.name: _period_ns(config.log_hz.get(topic.name, topic.log_hz)) for topic in self.reads}
         self._due_ns: dict[str, int] = {}
         self._latched: dict[str, Entry] = {}
         self._lost: Counter[str] = Counter()
@@ -110,9 +108,7 @@ class Recorder(Tap[RecorderConfig]):
             self._latched[entry.channel] = replace(entry, payload=(bytes(sample.payload),))
         yield from ()
 
-    def command(
-        self, verb: str, parameters: Mapping[str, Any], now_ns: int
-    ) -> Iterator[Message | Mapping[str, Any]]:
+    def command(self, verb: str, parameters: Mapping[str, Any], now_ns: int) -> Iterator[Message | Mapping[str, Any]]:
         match verb:
             case "start":
                 if self._spool is not None and not self._spool.trouble:
@@ -160,9 +156,6 @@ class Recorder(Tap[RecorderConfig]):
 
     def _entry(self, sample: Sample, message: Message) -> Entry:
         """Where a sample goes in the log; its payload is still the sender's."""
-        attachment = None
-        if isinstance(message, ProjectorCalibration) and message.yaml:
-            attachment = Attachment(CALIBRATION_FILE, "application/yaml", message.yaml.encode())
         return Entry(
             channel=sample.topic.channel(sample.source),
             kind=self._kinds[sample.topic.name],
@@ -171,7 +164,7 @@ class Recorder(Tap[RecorderConfig]):
             publish_ns=max(0, message.stamp_ns),  # the format knows no time before 1970
             payload=(sample.payload,),
             latched=sample.topic.latched,
-            attachment=attachment,
+            attachment=calibration_of(message),
         )
 
     def _put(self, spool: Spool, entry: Entry, sample: Sample, message: Message) -> None:

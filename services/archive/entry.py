@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from endo3d.schemas import codec, topics
+from endo3d.schemas.messages import Message, ProjectorCalibration
 from endo3d.services.archive.layout import Buffer
 from endo3d.services.archive.writer import Kind
 
@@ -44,3 +46,25 @@ class Entry:
     """Every part of a split recording repeats the last one."""
     attachment: Attachment | None = None
     """A file that came with it: the calibration."""
+
+
+def entry_of(message: Message) -> Entry:
+    """A message written without a recorder: it arrives when it was made."""
+    topic = topics.of(message)
+    return Entry(
+        channel=topic.channel(),
+        kind=Kind(*codec.schema(topic)),
+        sequence=getattr(message, "sequence", 0),
+        log_ns=message.stamp_ns,
+        publish_ns=message.stamp_ns,
+        payload=(codec.encode(message),),
+        latched=topic.latched,
+        attachment=calibration_of(message),
+    )
+
+
+def calibration_of(message: Message) -> Attachment | None:
+    """The calibration file, when a message carries it."""
+    if not isinstance(message, ProjectorCalibration) or not message.yaml:
+        return None
+    return Attachment(CALIBRATION_FILE, "application/yaml", message.yaml.encode())

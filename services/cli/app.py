@@ -75,7 +75,7 @@ def load(name: str) -> Any:
         subcommands = typer.Typer(
             add_completion=False, pretty_exceptions_enable=False, rich_markup_mode="rich"
         )
-        subcommands.command(name)(getattr(module, name))
+        subcommands.command(name)(getattr(module, _module(name).rpartition(".")[2]))
     command = typer.main.get_command(subcommands)
     command.name = name
     return command

@@ -1,0 +1,1 @@
+"""Images that other instruments took, as frames of endo3d."""
