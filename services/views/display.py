@@ -14,7 +14,7 @@ from endo3d.services.views.blueprint import BEFORE_ANY_MAP, Stand
 from endo3d.services.views.colouring import colouring
 from endo3d.services.views.entries import Entry
 from endo3d.services.views.merged import MergedMap, starts_afresh
-from endo3d.services.views.principal import principal
+from endo3d.services.views.principal import principal, without_strays
 from endo3d.services.views.scan import xyz
 from endo3d.services.views.splat import looking, oblique
 
@@ -101,7 +101,7 @@ class Display:
         points = self.merged.points()
         if points is None or len(points) < 3:
             return BEFORE_ANY_MAP
-        positions = xyz(points[:: -(-len(points) // 50_000)])
+        positions = without_strays(xyz(points[:: -(-len(points) // 50_000)]))
         axes, centre = principal(positions, self.viewer)
         seen = np.concatenate([positions, np.reshape(self.way, (-1, 3))])
         eye = looking(seen, oblique(axes), axes[2], (1600, 1200), field_deg=RERUN_FIELD_DEG)

@@ -13,12 +13,13 @@ from numpy.typing import NDArray
 from endo3d.services.views import figures
 from endo3d.services.views.colour import spread
 from endo3d.services.views.colouring import Colouring, colouring
-from endo3d.services.views.principal import principal
+from endo3d.services.views.principal import principal, without_strays
 from endo3d.services.views.scan import Scan, xyz
-from endo3d.services.views.splat import Eye, looking, oblique, render
+from endo3d.services.views.splat import BACKGROUND, Eye, looking, oblique, render
 
 SIZE_PX = (2400, 1350)
-SCENE_PX = (1650, 1350)
+SCENE_PX, WORDS_PX = (1650, 1190), 160
+"""The cloud, and the strip above it for the title."""
 WAY_RGB = (255, 166, 77)
 FRUSTUM_RGB = (255, 214, 160)
 MOST_POINTS = 3_000_000
@@ -44,7 +45,9 @@ def picture(
         scene.set_axis_off()
         if len(points) > 2:
             shown = colouring(points, colour, scan.viewer(), deviation_um)
-            scene.imshow(three_d(scan, xyz(points), shown.rgb()), interpolation="none")
+            image = three_d(scan, xyz(points), shown.rgb())
+            above = np.broadcast_to(BACKGROUND[0].astype(np.uint8), (WORDS_PX, SCENE_PX[0], 3))
+            scene.imshow(np.concatenate([above, image]), interpolation="none")
             _ramp(fig, shown)
         _words(fig, scan, len(points), title)
         left, width = 0.728, 0.254
@@ -63,7 +66,8 @@ def three_d(
     axes, centre = principal(points, scan.viewer())
     track = scan.track()
     frustum = _frustum(scan, track[-1]) if len(track) else np.empty((0, 3))
-    seen = np.concatenate([points[:: max(1, len(points) // 50_000)], track[:, :3, 3], frustum])
+    bulk = without_strays(points[:: max(1, len(points) // 50_000)])
+    seen = np.concatenate([bulk, track[:, :3, 3], frustum])
     eye = looking(seen, oblique(axes), axes[2], (2 * size[0], 2 * size[1]))
     image, depth = render(points, rgb, eye, _spacing_mm(points, scan.merged.merging_distance_mm))
     if len(track):
@@ -155,7 +159,7 @@ def _words(fig: Figure, scan: Scan, count: int, title: str) -> None:
         scene = scan.truths[-1].scene.split()[0]
         text = f"simulated frames: virtual rig, scene {scene}"
         fig.text(0.025, 0.880, text, fontsize=10, va="top", style="italic", color=figures.COLOURS[1])
-    fig.text(0.045, 0.028, "orange: way of the tip, camera frustum at the last pose", fontsize=8, color="#b9bec7")
+    fig.text(0.025, 0.028, "orange: way of the tip, camera frustum at the last pose", fontsize=8, color="#b9bec7")
 
 
 def _image(axes: Axes, scan: Scan) -> None:

@@ -21,6 +21,14 @@ def principal(
     return np.stack([along, np.cross(up, along), up]), centre
 
 
+def without_strays(points: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Those of (n, 3) points that a view should be chosen by: a few far ones must not make all others small."""
+    low, high = np.quantile(points, [0.003, 0.997], axis=0)
+    margin = 0.05 * (high - low)
+    kept: NDArray[np.floating] = points[((points >= low - margin) & (points <= high + margin)).all(axis=1)]
+    return kept
+
+
 def heights_mm(points: NDArray[np.floating], viewer: NDArray[np.floating]) -> NDArray[np.float64]:
     """(n,) height of every point over the mean plane, towards the viewer; NaN where a point is."""
     finite = points[np.isfinite(points).all(axis=1)]

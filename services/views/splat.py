@@ -121,6 +121,7 @@ def shade(depth: NDArray[np.float32], eye: Eye, scale_mm: float) -> NDArray[np.f
         around = _masked_blur(filled, seen, reach * near)
         hollow += np.clip((smooth - around) / (reach * scale_mm), 0, 1)
     light = (0.42 + 0.78 * lambert + 0.25 * head) * np.exp(-0.5 * hollow)
+    light = 1.12 * (1.0 - np.exp(-1.55 * light))  # bright slopes keep their colour
     return np.where(seen, light, 0).astype(np.float32)
 
 

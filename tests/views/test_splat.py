@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from endo3d.services.views.principal import heights_mm, principal
+from endo3d.services.views.principal import heights_mm, principal, without_strays
 from endo3d.services.views.splat import Eye, looking, render
 
 
@@ -82,3 +82,9 @@ def test_height_is_over_the_mean_plane_towards_the_viewer() -> None:
     np.testing.assert_allclose(heights, bumps, atol=0.01)
     axes, _ = principal(points, np.zeros(3))
     np.testing.assert_allclose(abs(axes @ tilt), np.eye(3), atol=0.01)
+
+
+def test_a_few_strays_do_not_choose_the_view() -> None:
+    points = np.concatenate([wall(20.0, 4.0), [[0, 0, 60], [90, 0, 20], [0, -80, 20]]])
+    kept = without_strays(points)
+    np.testing.assert_array_equal(kept, wall(20.0, 4.0))
