@@ -16,7 +16,6 @@ from pathlib import Path
 from endo3d.schemas import topics
 from endo3d.services.archive.reader import Log
 from endo3d.services.cli.demo import scan
-from endo3d.services.runtime.bus import Bus
 
 SCENE = "contour texture=noise:0.15:0.15"
 RATE_HZ, SECONDS = 172.0, 26.0
@@ -34,8 +33,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory(dir=FRAMES.parent) as folder:
         settings = [f"rig.name=stack{os.getpid()}", f"player.log={FRAMES.resolve()}", "viewer.port=0"]
         settings += [f"recorder.directory={folder}", "recorder.name=scan", "viewer.web_port=0"]
-        settings += ["player.rate=0"]  # until everybody is ready
-        run = scan("player", settings, seconds=10 * SECONDS, quiet=True, when_ready=play)
+        run = scan("player", settings, seconds=10 * SECONDS, quiet=True)
         recorded = Log(Path(folder) / "scan.mcap")
         counts = {topic.name: recorded.count(topic) for topic in (topics.FRAME, topics.POSE)}
     print(f"first cloud {run['start_s']:.1f} s after the command, then {run['scan_s']:.1f} s at {RATE_HZ:g} Hz")
@@ -50,10 +48,6 @@ def main() -> None:
     print(f"newest frame to pose   p50 {pose['p50']:.1f} ms, p99 {pose['p99']:.1f} ms")
     for name, status in run["services"].items():
         print(f"{name:<10} {status['cpu_percent']:5.0f} % of a core, {status['memory_mb']:6.0f} MB")
-
-
-def play(bus: Bus) -> None:
-    bus.call("player", "rate", {"rate": 1.0})
 
 
 if __name__ == "__main__":

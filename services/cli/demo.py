@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from endo3d.services.cli.pace import Pace
     from endo3d.services.cli.up import Asked
     from endo3d.services.cli.watch import Watch
-    from endo3d.services.runtime.bus import Bus
     from endo3d.services.runtime.launcher import Launcher
     from endo3d.services.runtime.stack_file import Stack
 
@@ -79,17 +78,8 @@ def _pace(stack: str, settings: list[str]) -> Pace | None:
     return measure(stack_file.load(stack, settings))
 
 
-def scan(
-    stack: str,
-    overrides: list[str],
-    seconds: float,
-    quiet: bool,
-    when_ready: Callable[[Bus], object] = lambda bus: None,
-) -> dict[str, Any]:
-    """Run the stack for ``seconds`` from its first cloud on; what was measured while it ran.
-
-    ``when_ready`` is called once, when every service has said it is ready.
-    """
+def scan(stack: str, overrides: list[str], seconds: float, quiet: bool) -> dict[str, Any]:
+    """Run the stack for ``seconds`` from its first cloud on; what was measured while it ran."""
     from endo3d.services.cli.up import Asked
     from endo3d.services.cli.watch import Watch, percentiles_ms
     from endo3d.services.runtime import graph, stack_file
@@ -109,9 +99,7 @@ def scan(
         with Launcher(children_of(described, overrides), lines) as launcher, _progress(quiet) as progress:
             lines.progress = progress
             launcher.start()
-            _await_ready(launcher, watch, asked, described, progress, began_s)
-            when_ready(bus)
-            _await_first_cloud(launcher, watch, asked, progress, began_s)
+            _await_first_cloud(launcher, watch, asked, described, progress, began_s)
             scanned_s = _scan(launcher, watch, asked, described, progress, seconds)
             progress.update(progress.add_task("closing the archive", total=None))
             launcher.stop(hurry=lambda: asked.times > 1)
@@ -155,26 +143,20 @@ def _progress(quiet: bool) -> Iterator[Progress]:
         yield progress
 
 
-def _await_ready(
+def _await_first_cloud(
     launcher: Launcher, watch: Watch, asked: Asked, stack: Stack, progress: Progress, began_s: float
 ) -> None:
     names = list(stack.tables)
     task = progress.add_task("starting", total=len(names))
     say_at_s = time.monotonic() + PATIENCE_S
-    while (missing := watch.starting(names)) and not (launcher.done or asked.times or watch.clouds):
-        spent_s = time.monotonic() - began_s
-        why = ": compiling their kernels, the first time only" if spent_s > PATIENCE_S else ""
-        progress.update(task, completed=len(names) - len(missing), description=f"starting {', '.join(missing)}{why}")
-        if time.monotonic() > say_at_s and not progress.console.is_terminal and not progress.disable:
-            progress.console.print(f"{spent_s:.0f} s: starting {', '.join(missing)}{why}", soft_wrap=True)
-            say_at_s += PATIENCE_S
-        _turn_or_give_up(launcher, began_s)
-    progress.remove_task(task)
-
-
-def _await_first_cloud(launcher: Launcher, watch: Watch, asked: Asked, progress: Progress, began_s: float) -> None:
-    task = progress.add_task("waiting for the first cloud", total=None)
     while not watch.clouds and not (launcher.done or asked.times):
+        missing, spent_s = watch.starting(names), time.monotonic() - began_s
+        what = f"starting {', '.join(missing)}" if missing else "waiting for the first cloud"
+        what += ": compiling their kernels, the first time only" if missing and spent_s > PATIENCE_S else ""
+        progress.update(task, completed=len(names) - len(missing), description=what)
+        if time.monotonic() > say_at_s and not progress.console.is_terminal and not progress.disable:
+            progress.console.print(f"{spent_s:.0f} s: {what}", soft_wrap=True)
+            say_at_s += PATIENCE_S
         _turn_or_give_up(launcher, began_s)
     progress.remove_task(task)
 
