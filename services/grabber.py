@@ -18,7 +18,7 @@ from endo3d.services.devices.uri import DeviceError, Setting
 from endo3d.services.runtime import service
 from endo3d.services.runtime.errors import UserError
 from endo3d.services.runtime.service import Exhausted, Source
-from endo3d_core.calibration import Rig
+from endo3d_core.calibration import Lens, Rig
 
 TURN_S = 0.004
 REOPEN_NS = 1_000_000_000
@@ -162,10 +162,13 @@ class Grabber(Source[GrabberConfig]):
             yield Truth(stamp_ns, label.sequence, camera.T_scene_camera(stamp_ns), camera.scene, camera.slow_motion)
 
     def calibration(self) -> Iterator[Message]:
-        """What the frames were taken with; the camera's lens as it is binned."""
+        """What the frames were taken with; the camera's lens as it is binned and cut to a region."""
         rig, now_ns = Rig.from_yaml(self.yaml), self.camera.now_ns()
-        bin_px = max(1, round(rig.camera.width / self.camera.shape[1]))
-        lens, projector = rig.camera.binned(bin_px), rig.projector
+        height, width = self.camera.shape
+        binned = rig.camera.binned(self.camera.bin_px or max(1, round(rig.camera.width / width)))
+        K = binned.K.copy()
+        K[:2, 2] -= self.camera.corner
+        lens, projector = Lens(width, height, K, binned.dist), rig.projector
         yield CameraCalibration(now_ns, lens.width, lens.height, lens.K, lens.dist)
         yield ProjectorCalibration(
             now_ns,

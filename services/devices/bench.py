@@ -17,6 +17,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from endo3d_core.slot_identity import Timeline
+
 HEADER_BYTES = 65_536
 IMAGES = 128
 IMAGE_BYTES = 2048 * 1200
@@ -46,6 +48,14 @@ class Shown:
     """Counts replacements of the images."""
     begun_ns: int = 0
     """When light was first shown on this bench: the simulated world's time 0."""
+
+    @property
+    def timeline(self) -> Timeline | None:
+        """When which slot is shown; None in the dark."""
+        if not self.running:
+            return None
+        periods_ns = np.rint((np.array(self.exposures_us) + self.dark_us) * 1e3).astype(np.int64)
+        return Timeline(self.start_ns, np.concatenate(([0], np.cumsum(periods_ns))), self.exposures_us)
 
 
 def dark(shown: Shown) -> Shown:
@@ -125,5 +135,7 @@ class Bench:
 
     def close(self) -> None:
         """Unmap; the file stays, so that whoever is left goes on."""
+        if self._map.closed:
+            return
         del self._counter, self._length, self._bytes
         self._map.close()

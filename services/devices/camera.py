@@ -37,6 +37,14 @@ class Camera(Protocol):
     def dtype(self) -> DTypeLike:
         """uint8 or uint16."""
 
+    @property
+    def corner(self) -> tuple[int, int]:
+        """(x, y) of the images' first pixel on the sensor, in their own pixels: a region starts elsewhere than 0, 0."""
+
+    @property
+    def bin_px(self) -> int | None:
+        """Sensor pixels per image pixel; None where the driver can't know."""
+
     def arm(self) -> None:
         """Be ready for triggers; what was exposed before is discarded."""
 

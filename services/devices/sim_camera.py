@@ -48,15 +48,18 @@ def open_uri(uri: Uri, setting: Setting) -> SimCamera:
     if not slow_motion > 0.0:
         raise DeviceError(f"device {uri.text!r}: slow_motion must be positive")
     renderer = Renderer(rig, head, scene, PRESETS[preset], bin_px=int(bin_px))
-    return SimCamera(Bench(path), renderer, motion, slow_motion, int(seed))
+    return SimCamera(Bench(path), renderer, motion, slow_motion, int(seed), int(bin_px))
 
 
 class SimCamera:
     """Triggered by the bench's light; as on a real one, a trigger while it is busy makes no frame."""
 
-    def __init__(self, bench: Bench, renderer: Renderer, motion: Motion, slow_motion: float, seed: int) -> None:
+    def __init__(
+        self, bench: Bench, renderer: Renderer, motion: Motion, slow_motion: float, seed: int, bin_px: int
+    ) -> None:
         self._bench, self._renderer, self._motion = bench, renderer, motion
         self.scene, self.slow_motion = renderer.scene.text, slow_motion
+        self.corner, self.bin_px = (0, 0), bin_px
         self._seed = seed
         self._lent: deque[NDArray[Any]] = deque()
         self._shown, self._changes = Shown(), -1
@@ -158,16 +161,13 @@ class SimCamera:
         self._changes = self._bench.changes
         self._shown = shown = self._bench.read()
         self._next = 0
-        self._timeline = None
+        self._timeline = shown.timeline
         if self._exposing is not None:  # cut off by the projector: no whole image
             self._lent.append(self._exposing.image)
             self._exposing = None
         if shown.generation != self._generation:
             self._lights = [self._renderer.light(self._bench.image(place, shown)) for place in range(shown.placed)]
             self._generation = shown.generation
-        if shown.running:
-            periods_ns = np.rint((np.array(shown.exposures_us) + shown.dark_us) * 1e3).astype(np.int64)
-            self._timeline = Timeline(shown.start_ns, np.concatenate(([0], np.cumsum(periods_ns))), shown.exposures_us)
 
 
 def _sleep_until(stamp_ns: int) -> None:

@@ -1,11 +1,14 @@
 from __future__ import annotations
 
+from collections.abc import Iterator
 from importlib import resources
 
 import pytest
+from fake_gige import FakeGige, running
 from plugged import Plugged
 
-from endo3d.services.devices.uri import Setting
+from endo3d.services.devices.aravis_camera import library
+from endo3d.services.devices.uri import DeviceError, Setting
 
 
 @pytest.fixture(scope="session")
@@ -17,3 +20,13 @@ def setting() -> Setting:
 @pytest.fixture
 def plugged() -> Plugged:
     return Plugged()
+
+
+@pytest.fixture
+def fake_gige() -> Iterator[FakeGige]:
+    try:
+        library()
+    except DeviceError as error:
+        pytest.skip(str(error))
+    with running() as gige:
+        yield gige
