@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import threading
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
@@ -23,9 +24,10 @@ from endo3d.services.archive.facts import host_facts
 from endo3d.services.archive.layout import Buffer
 from endo3d.services.archive.reader import Unreadable
 from endo3d.services.archive.recording import Recording
-from endo3d.services.archive.recover import is_torn, recover
+from endo3d.services.archive.recover import is_whole, recover
 from endo3d.services.archive.spool import Spool
 from endo3d.services.archive.writer import Kind
+from endo3d.services.runtime.errors import UserError
 from endo3d.services.runtime.service import Config, Refused, Sample, Tap
 
 _log = logging.getLogger(__name__)
@@ -86,12 +88,20 @@ class Recorder(Tap[RecorderConfig]):
         self._start_at_next = config.autostart
 
     def open(self) -> None:
-        """Repair what a crash left torn in the directory, in the background. Raises ``UserError``."""
+        """Repair what a crash left torn in the directory, in the background.
+
+        Raises ``UserError`` when it can't be written to, or a package for packing is missing.
+        """
         self._transform = _compactor() if self.config.compact else _as_it_is
-        if self.config.directory.is_dir():
-            repair = partial(_repair, self.config.directory)
-            self._repairing = threading.Thread(target=repair, name="repair", daemon=True)
-            self._repairing.start()
+        directory = self.config.directory
+        try:
+            directory.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise UserError(f"can't make the directory {directory}: {error.strerror}; choose another") from error
+        if not os.access(directory, os.W_OK | os.X_OK):
+            raise UserError(f"can't write into {directory}; set recorder.directory to another")
+        self._repairing = threading.Thread(target=_repair, args=(directory,), name="repair", daemon=True)
+        self._repairing.start()
 
     def take(self, sample: Sample) -> Iterator[Message]:
         try:
@@ -113,8 +123,11 @@ class Recorder(Tap[RecorderConfig]):
             case "start":
                 if self._spool is not None and not self._spool.trouble:
                     raise Refused(f"already recording {self._spool.recording.path}; stop it first")
+                name = str(parameters.get("name", ""))
+                if name != Path(name).name:
+                    raise Refused(f"{name!r} is not a plain file name")
                 self._stop()
-                spool = self._start(str(parameters.get("name", "")), now_ns)
+                spool = self._start(name, now_ns)
                 yield {"recording": str(spool.recording.path)}
             case "stop":
                 if self._spool is None:
@@ -144,7 +157,7 @@ class Recorder(Tap[RecorderConfig]):
     def losses(self) -> Mapping[str, int]:
         if self._spool is None:
             return dict(self._lost)
-        return self._lost + Counter(_causes(self._spool))
+        return self._lost.copy() + Counter(_causes(self._spool))
 
     def trouble(self) -> str:
         return self._spool.trouble if self._spool is not None else ""
@@ -270,9 +283,10 @@ def _compactor() -> Callable[[Entry], Entry]:
 
 def _repair(directory: Path) -> None:
     """Give every torn log here its index; one that is being recorded, or beyond repair, stays as it is."""
+    os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), 19)  # the recording comes first
     for path in sorted(directory.glob("*.mcap")):
         try:
-            if is_torn(path):
+            if not is_whole(path):
                 report = recover(path)
                 _log.warning("repaired %s: %d messages kept", path, report.messages)
         except (Unreadable, OSError) as error:

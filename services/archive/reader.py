@@ -238,10 +238,12 @@ class Log:
             raise Unreadable(f"{self.path} is not an MCAP log")
         if self._map[whole - 8 :] != layout.MAGIC:
             raise Unreadable(f"{self.path} was not closed (a crash?): endo3d recover {self.path}")
-        start: int = FOOTER.unpack_from(self._map, whole - _TAIL_BYTES + layout.RECORD.size)[0]
+        start, _, crc = FOOTER.unpack_from(self._map, whole - _TAIL_BYTES + layout.RECORD.size)
         if not 0 < start <= whole - _TAIL_BYTES:
             raise Unreadable(f"{self.path} has no index: endo3d recover {self.path}")
-        return start
+        if crc and zlib.crc32(self._map[start : whole - len(layout.MAGIC) - 4]) != crc:
+            raise Unreadable(f"the index of {self.path} is damaged: endo3d recover {self.path}")
+        return int(start)
 
 
 def _mapped(path: Path) -> mmap.mmap:

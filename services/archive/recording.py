@@ -105,7 +105,7 @@ class Recording:
         for attachment in self._attachments.values():
             _attach(writer, attachment, entry.log_ns)
         for latched in self._latched.values():
-            _write(writer, latched)
+            _write(writer, replace(latched, log_ns=entry.log_ns))
         return writer
 
     def _unused_path(self) -> Path:

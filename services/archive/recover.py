@@ -18,7 +18,7 @@ from mcap.records import Attachment, AttachmentIndex, Channel, Metadata, Metadat
 from endo3d.services.archive import layout
 from endo3d.services.archive.facts import LIBRARY
 from endo3d.services.archive.layout import ChunkIndex
-from endo3d.services.archive.reader import Unreadable
+from endo3d.services.archive.reader import Log, Unreadable
 from endo3d.services.archive.scan import TORN, Damage, Found, FoundChunk, walk
 from endo3d.services.archive.sink import FileSink
 from endo3d.services.archive.summary import Summary
@@ -41,12 +41,13 @@ class Report:
     """There was nothing to do."""
 
 
-def is_torn(path: Path) -> bool:
-    """Whether a log lacks its end."""
-    with path.open("rb") as file:
-        size = file.seek(0, os.SEEK_END)
-        file.seek(max(0, size - len(layout.MAGIC)))
-        return file.read() != layout.MAGIC or size < 2 * len(layout.MAGIC)
+def is_whole(path: Path) -> bool:
+    """Whether a log has its index."""
+    try:
+        Log(path)
+    except Unreadable:
+        return False
+    return True
 
 
 def recover(path: Path, out: Path | None = None) -> Report:
@@ -62,7 +63,7 @@ def recover(path: Path, out: Path | None = None) -> Report:
         _lock(file.fileno(), path)
         view = _mapped(file.fileno(), path)
         inventory = _inventory(view, path)
-        if out is None and not inventory.damages and not is_torn(path):
+        if out is None and not inventory.damages and is_whole(path):
             return inventory.report(path, 0, was_whole=True)
         if out is None and inventory.repairable:
             _append_summary(file.fileno(), inventory)

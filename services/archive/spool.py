@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import tempfile
 import threading
 import time
 from collections import Counter, defaultdict
@@ -11,6 +12,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from queue import Empty, SimpleQueue
+from typing import IO
 
 from endo3d.services.archive.entry import Entry
 from endo3d.services.archive.recording import Recording
@@ -73,17 +75,23 @@ class Spool:
         transform: Callable[[Entry], Entry] = lambda entry: entry,
     ) -> None:
         self.recording = recording
-        self.dropped: Counter[str] = Counter()
-        """Messages lost, per channel."""
+        self._refused: Counter[str] = Counter()
+        self._unwritten: Counter[str] = Counter()
+        # Two counters, for two threads count: the caller's and the writer's.
         self.trouble = ""
         """One line for people once recording has stopped by itself."""
         self._slots = Slots(queue_bytes)
         self._queue: SimpleQueue[tuple[Entry, bytearray] | None] = SimpleQueue()
         self._floor_bytes = floor_bytes
         self._transform = transform
-        self._reserve = _reserve(recording.path, reserve_bytes)
+        self._reserve = _reserve(recording.path.parent, reserve_bytes)
         self._thread = threading.Thread(target=self._run, name="archive", daemon=True)
         self._thread.start()
+
+    @property
+    def dropped(self) -> Counter[str]:
+        """Messages lost, per channel."""
+        return self._refused.copy() + self._unwritten.copy()
 
     @property
     def queued(self) -> int:
@@ -101,16 +109,20 @@ class Spool:
 
         ``valid`` is asked after the filling: False when its source was overwritten meanwhile.
         """
-        memory = self._memory(size)
+        memory, kept = self._memory(size), False
         if memory is not None:
             payload = memoryview(memory)[:size]
-            fill(payload)
-            if valid():
-                self._queue.put((replace(entry, payload=(payload,)), memory))
-                return True
-            self._give(memory)
-        self.dropped[entry.channel] += 1
-        return False
+            try:
+                fill(payload)
+                kept = valid()
+            finally:
+                if not kept:
+                    self._give(memory)
+        if memory is None or not kept:
+            self._refused[entry.channel] += 1
+            return False
+        self._queue.put((replace(entry, payload=(payload,)), memory))
+        return True
 
     def close(self) -> None:
         """Write what is queued and close the file; blocks until that is done."""
@@ -140,19 +152,18 @@ class Spool:
                 break
             entry, memory = item
             if not self._guarded(self._write, entry):
-                self.dropped[entry.channel] += 1
+                self._unwritten[entry.channel] += 1
             self._give(memory)
             self._guarded(self._look_at_disk)
             if time.monotonic() >= flush_due:
                 self._guarded(self.recording.flush)
                 flush_due = time.monotonic() + FLUSH_S
         self._guarded(self.recording.finish)
-        if self._reserve is not None:
-            self._reserve.unlink(missing_ok=True)
+        self._reserve.close()
 
     def _write(self, entry: Entry) -> None:
         if self.trouble:
-            self.dropped[entry.channel] += 1
+            self._unwritten[entry.channel] += 1
         else:
             self.recording.put(self._transform(entry))
 
@@ -168,12 +179,11 @@ class Spool:
             write(*arguments)
             return True
         except Exception as error:  # whatever it is, the pipeline goes on and the status says it
-            if self._reserve is not None:
-                self._reserve.unlink(missing_ok=True)
+            self._reserve.close()
             what = error.strerror if isinstance(error, OSError) else f"{type(error).__name__}: {error}"
             self._stop(f"{what}: recording closed; make room on the disk and start again")
             try:
-                self.dropped.update(self.recording.abandon_tail())
+                self._unwritten.update(self.recording.abandon_tail())
                 self.recording.finish()
             except OSError as second:
                 self.recording.leave_torn()
@@ -185,15 +195,16 @@ class Spool:
         _log.error("%s", why)
 
 
-def _reserve(log: Path, size: int) -> Path | None:
-    """A file of ``size`` bytes, freed when the disk is full so that the summary still fits."""
-    log.parent.mkdir(parents=True, exist_ok=True)
-    if not size:
-        return None
-    path = log.with_name(f".{log.name}.reserve")
-    with path.open("wb") as file:
-        os.posix_fallocate(file.fileno(), 0, size)
-    return path
+def _reserve(directory: Path, size: int) -> IO[bytes]:
+    """A nameless file of ``size`` bytes: closed, or its process killed, it gives room for a log's end."""
+    directory.mkdir(parents=True, exist_ok=True)
+    file = tempfile.TemporaryFile(dir=directory)  # noqa: SIM115 - as long as the recording lasts
+    if size:
+        try:
+            os.posix_fallocate(file.fileno(), 0, size)
+        except OSError as error:
+            _log.warning("no reserve of %d MB for the log's end: %s", size >> 20, error.strerror)
+    return file
 
 
 def _free_bytes(directory: Path) -> int:

@@ -17,7 +17,7 @@ from recorded import YAML, frame, pose, same, sample
 
 from endo3d.schemas import topics
 from endo3d.services.archive.reader import Log, Unreadable
-from endo3d.services.archive.recover import is_torn, recover
+from endo3d.services.archive.recover import is_whole, recover
 from endo3d.services.archive.spool import FLUSH_S
 from endo3d.services.recorder import Recorder, RecorderConfig
 
@@ -31,7 +31,7 @@ def test_killed_at_any_moment_a_log_loses_its_last_chunk_at_most(tmp_path: Path)
         directory = tmp_path / str(kill)
         taken, killed_ns = _record_and_kill(directory, moments.uniform(0.1, 1.2))
         log = directory / "scan.mcap"
-        assert is_torn(log)
+        assert not is_whole(log)
         with pytest.raises(Unreadable, match="endo3d recover"):
             Log(log)
         recover(log)

@@ -26,6 +26,7 @@ from endo3d.services.archive.compact import Packer, unpack
 from endo3d.services.archive.crop import Crop
 from endo3d.services.archive.reader import Log
 from endo3d.services.recorder import Recorder, RecorderConfig
+from endo3d.services.runtime.errors import UserError
 from endo3d.services.runtime.service import Refused, Sample
 
 
@@ -128,6 +129,17 @@ def test_start_and_stop(tmp_path: Path) -> None:
     take(service, [frame(3)])
     service.close()
     assert list(tmp_path.iterdir()) == [tmp_path / "first.mcap"]
+
+
+def test_what_cannot_be_recorded_to(tmp_path: Path) -> None:
+    service = recorder(tmp_path, autostart=False)
+    for name in ("../elsewhere", "/elsewhere", "a/b"):
+        with pytest.raises(Refused, match="plain file name"):
+            command(service, "start", name=name)
+    service.close()
+    (tmp_path / "file").write_bytes(b"")
+    with pytest.raises(UserError, match=r"can't make the directory .*; choose another"):
+        recorder(tmp_path / "file" / "logs")
 
 
 def test_status_of_several_services_go_to_channels_of_their_own(tmp_path: Path) -> None:

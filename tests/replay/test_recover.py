@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 
 from endo3d.services.archive.reader import Log, Unreadable
-from endo3d.services.archive.recover import is_torn, recover
+from endo3d.services.archive.recover import is_whole, recover
 from endo3d.services.archive.sink import FileSink
 from endo3d.services.archive.writer import OWN_CHUNK_BYTES, Kind, Writer
 
@@ -66,7 +66,7 @@ def test_cut_anywhere(whole: Path, tmp_path: Path, data: st.DataObject) -> None:
         with pytest.raises(Unreadable, match="no whole message"):
             recover(torn)
         return
-    assert is_torn(torn)
+    assert not is_whole(torn)
     report = recover(torn)
     assert not report.was_whole
     assert report.messages == len(expected)
@@ -98,6 +98,17 @@ def test_a_flipped_bit_costs_its_chunk_only(whole: Path, tmp_path: Path, image: 
     assert report.damaged_copy.read_bytes() == content
     assert Log(damaged).attachments == {"early": b"early", "late": b"late"}
     assert Log(damaged).streams[1].crop == Log(whole).streams[1].crop is not None
+
+
+def test_a_damaged_index_is_written_again(whole: Path, tmp_path: Path) -> None:
+    damaged = tmp_path / "damaged.mcap"
+    content = bytearray(whole.read_bytes())
+    content[-100] ^= 1
+    damaged.write_bytes(content)
+    with pytest.raises(Unreadable, match=r"index of .* is damaged: endo3d recover"):
+        Log(damaged)
+    assert not recover(damaged).was_whole
+    assert damaged.read_bytes() == whole.read_bytes()
 
 
 def test_into_another_file_the_torn_one_stays(whole: Path, tmp_path: Path) -> None:
