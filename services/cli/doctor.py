@@ -221,7 +221,8 @@ def usb_access() -> Finding:
         return Finding("projector", Level.OK, "none on USB: the virtual rig is there (sim:)")
     closed = [f"{name} ({node})" for name, node in seen if not os.access(node, os.R_OK | os.W_OK)]
     if closed:
-        todo = "copy endo3d's udev rule to /etc/udev/rules.d (docs/deployment.md), then plug it in again"
+        rule = resources.files("endo3d.deploy") / "udev" / "70-endo3d.rules"
+        todo = f"sudo cp {rule} /etc/udev/rules.d/, then plug it in again"
         return Finding("projector", Level.WARN, f"no permission for {', '.join(closed)}", todo)
     return Finding("projector", Level.OK, ", ".join(name for name, _ in seen))
 
