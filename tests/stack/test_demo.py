@@ -49,7 +49,10 @@ def rig() -> str:
 def up(rig: str, folder: Path) -> Iterator[subprocess.Popen[str]]:
     """``endo3d up demo``, once clouds come."""
     with subprocess.Popen(
-        [*ENDO3D, "up", "demo", *settings(rig, folder)], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+        [*ENDO3D, "up", "demo", *settings(rig, folder), "--set", "sequencer.rate_hz=15"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
     ) as process:
         try:
             first = endo3d("tap", "pose", "--rig", rig, "-n", "1", "--timeout", str(START_LIMIT_S / 2))
@@ -150,7 +153,7 @@ def test_ctrl_c_ends_a_demo_early_with_its_table(tmp_path: Path) -> None:
     arguments = ["demo", "--seconds", "600", "--out", str(tmp_path), *settings(rig, tmp_path)]
     with subprocess.Popen([*ENDO3D, *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         try:
-            assert endo3d("tap", "pose", "--rig", rig, "-n", "60", "--timeout", str(START_LIMIT_S / 2)).returncode == 0
+            assert endo3d("tap", "pose", "--rig", rig, "-n", "30", "--timeout", str(START_LIMIT_S / 2)).returncode == 0
             began_s = time.monotonic()
             process.send_signal(signal.SIGINT)
             said, errors = process.communicate(timeout=90)
