@@ -2,7 +2,8 @@
 
 Loops stay vectorised if every array element is read before a conditional expression chooses
 (``v = a[x]; out[x] = v if good else zero``: a load inside the choice makes the loop scalar, five times slower),
-if rows of one scratch array never alias within a loop, and if constants are float32.
+if rows of one scratch array never alias within a loop, if constants are float32, and if no root or quotient is
+used on one side of a choice only (LLVM sinks it into a branch).
 """
 
 from __future__ import annotations

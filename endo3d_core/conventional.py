@@ -9,6 +9,8 @@ frequency has n steps.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +24,8 @@ from endo3d_core.phase import HALF, PER_TURN, TWO_PI, angle, wrap
 from endo3d_core.triangulation import Lookup
 from endo3d_core.uncertainty import IMX174, Sensor
 
+STRIP = 480
+"""Columns at a time."""
 MODULATION_MIN = 0.1
 """Least fringe contrast b/a of the first frequency."""
 
@@ -63,19 +67,76 @@ def phase_weights(weights: NDArray[np.float64], frequencies: tuple[float, ...]) 
     return np.asarray(information / information.sum())
 
 
+@dataclass(frozen=True, eq=False)
+class Groups:
+    """The patterns of each frequency in groups of four rows: what the demodulating loop adds up at once.
+
+    A frequency of three steps or more has a background of its own; one of two steps shares the first's.
+    """
+
+    frequency: NDArray[np.int64]
+    """(groups,) which one."""
+    patterns: NDArray[np.int64]
+    """(groups, 4) indices; a group that is not full repeats its first with weight 0."""
+    weights: NDArray[np.float32]
+    """(groups, 3, 4): of a, C, S."""
+    shared: NDArray[np.float32]
+    """(frequencies, 2) weights of the first frequency's a in C and S."""
+
+
+def groups(patterns: tuple[Pattern, ...], frequencies: tuple[float, ...]) -> Groups:
+    """Peng and Gupta's least squares, frequency by frequency."""
+    frequency, indices, weights, shared = [], [], [], np.zeros((len(frequencies), 2), np.float32)
+    for i, f in enumerate(frequencies):
+        own = [k for k, pattern in enumerate(patterns) if pattern.frequency == f]
+        shifts = np.array([patterns[k].shift_rad for k in own])
+        design = np.stack((np.ones(len(own)), np.cos(shifts), -np.sin(shifts)), axis=1)
+        solution = np.zeros((3, len(own)))
+        if np.linalg.matrix_rank(design, tol=1e-6) == 3:
+            solution[:] = np.linalg.pinv(design)
+        else:
+            solution[1:] = np.linalg.pinv(design[:, 1:])
+            shared[i] = -solution[1:].sum(axis=1)
+        for start in range(0, len(own), 4):
+            members = own[start : start + 4]
+            four = np.zeros((3, 4), np.float32)
+            four[:, : len(members)] = solution[:, start : start + 4]
+            frequency.append(i)
+            indices.append(members + members[:1] * (4 - len(members)))
+            weights.append(four)
+    return Groups(np.array(frequency), np.array(indices), np.stack(weights), shared)
+
+
 @kernel
-def _demodulate_row(fused: NDArray[np.float32], weights: NDArray[np.float32], out: NDArray[np.float32]) -> None:
-    """fused (patterns, width) -> out (components, width); both pattern counts are multiples of four."""
-    for c in range(out.shape[0]):
-        row = out[c]
-        row[:] = np.float32(0.0)
-        for p in range(0, weights.shape[1], 4):
-            w0, w1, w2, w3 = weights[c, p], weights[c, p + 1], weights[c, p + 2], weights[c, p + 3]
-            if w0 == 0.0 and w1 == 0.0 and w2 == 0.0 and w3 == 0.0:
-                continue
-            f0, f1, f2, f3 = fused[p], fused[p + 1], fused[p + 2], fused[p + 3]
-            for x in range(row.size):
-                row[x] += w0 * f0[x] + w1 * f1[x] + w2 * f2[x] + w3 * f3[x]
+def _add_four(
+    r0: NDArray[Any],
+    r1: NDArray[Any],
+    r2: NDArray[Any],
+    r3: NDArray[Any],
+    weights: NDArray[np.float32],
+    a: NDArray[np.float32],
+    c: NDArray[np.float32],
+    s: NDArray[np.float32],
+    brightest: NDArray[np.float32],
+) -> None:
+    a0, a1, a2, a3 = weights[0, 0], weights[0, 1], weights[0, 2], weights[0, 3]
+    c0, c1, c2, c3 = weights[1, 0], weights[1, 1], weights[1, 2], weights[1, 3]
+    s0, s1, s2, s3 = weights[2, 0], weights[2, 1], weights[2, 2], weights[2, 3]
+    for x in range(a.size):
+        g0, g1, g2, g3 = np.float32(r0[x]), np.float32(r1[x]), np.float32(r2[x]), np.float32(r3[x])
+        a[x] += a0 * g0 + a1 * g1 + a2 * g2 + a3 * g3
+        c[x] += c0 * g0 + c1 * g1 + c2 * g2 + c3 * g3
+        s[x] += s0 * g0 + s1 * g1 + s2 * g2 + s3 * g3
+        brightest[x] = max(max(max(g0, g1), max(g2, g3)), brightest[x])
+
+
+@kernel
+def _share_background(
+    a: NDArray[np.float32], c_share: np.float32, s_share: np.float32, c: NDArray[np.float32], s: NDArray[np.float32]
+) -> None:
+    for x in range(a.size):
+        c[x] = c_share * a[x]
+        s[x] = s_share * a[x]
 
 
 @kernel
@@ -105,7 +166,7 @@ def unwrap_row(
     for i in range(frequencies.size):
         c, s, w = components[1 + 2 * i], components[2 + 2 * i], wrapped[i]
         share = frequencies[i] / f1
-        for x in range(w.size):
+        for x in range(phase.size):
             w[x] = wrap(angle(s[x], c[x]) - share * carrier[x])
     residual[:] = zero
     phase[:] = zero
@@ -146,10 +207,13 @@ def unwrap_row(
 
 @kernel
 def _decode(
-    frames: NDArray[np.uint8] | NDArray[np.uint16] | NDArray[np.float32],
+    frames: NDArray[Any],
     exposures: NDArray[np.float32],
     saturation: float,
-    weights: NDArray[np.float32],
+    group_frequency: NDArray[np.int64],
+    group_patterns: NDArray[np.int64],
+    group_weights: NDArray[np.float32],
+    shared: NDArray[np.float32],
     frequencies: NDArray[np.float32],
     beat_with: NDArray[np.int64],
     beats: NDArray[np.float32],
@@ -169,32 +233,66 @@ def _decode(
     scratch: NDArray[np.float32],
     points: NDArray[np.float32],
 ) -> int:
+    """Rows in strips of ``STRIP`` columns, so that all scratch stays in the first-level cache."""
     scale, low, high = np.float32(px_per_rad), np.float32(z_min), np.float32(z_max)
-    rad_per_px, one, zero = np.float32(1.0) / scale, np.float32(1.0), np.float32(0.0)
-    exposed, brightest, carrier, phase = scratch[0], scratch[1], scratch[2], scratch[3]
-    residual, contrast, intensity, spread = scratch[4], scratch[5], scratch[6], scratch[7]
-    shortest = exposures[0]
+    rad_per_px, one, zero, nan = np.float32(1.0) / scale, np.float32(1.0), np.float32(0.0), np.float32(np.nan)
+    limit, gain, slope, offset, shortest = np.float32(saturation), noise[0], noise[1], noise[2], exposures[0]
+    height, width = frames.shape[1], frames.shape[2]
     count = 0
-    for v in range(frames.shape[1]):
-        fuse_row(frames, v, exposures, saturation, fused, exposed, brightest)
-        _demodulate_row(fused, weights, components)
-        triangulation.interpolate_row(planes, v / per_node, row)
-        for x in range(carrier.size):
-            carrier[x] = row[0, x] * rad_per_px
-        unwrap_row(
-            components, frequencies, beat_with, beats, phase_weight, carrier, contrast_min, dark,
-            wrapped, phase, residual, contrast,
-        )  # fmt: skip
-        c1, s1, background = components[1], components[2], components[0]
-        for x in range(phase.size):
-            power = c1[x] * c1[x] + s1[x] * s1[x]
-            variance = noise[0] * (noise[1] * background[x] + noise[2])
-            spread[x] = variance / max(power, np.float32(1e-6))
-            # Grey values per unit of the shortest exposure, whatever was fused.
-            grey, time = background[x] * shortest, exposed[x]
-            intensity[x] = grey / max(time, shortest)
-            residual[x] = min(contrast[x], one) * max(one - residual[x], zero)
-        count += triangulation.write_row(row, scale, low, high, phase, intensity, residual, spread, points[v])
+    for v in range(height):
+        for left in range(0, width, STRIP):
+            n = min(STRIP, width - left)
+            right = left + n
+            exposed, brightest, carrier, phase = scratch[0, :n], scratch[1, :n], scratch[2, :n], scratch[3, :n]
+            residual, contrast, intensity, spread = scratch[4, :n], scratch[5, :n], scratch[6, :n], scratch[7, :n]
+            a, spare = components[0, :n], scratch[8, :n]
+            if exposures.size > 1:
+                fuse_row(frames, v, left, right, exposures, saturation, fused, exposed, brightest)
+            brightest[:] = zero
+            for i in range(components.shape[0]):
+                components[i, :n] = zero
+            for i in range(group_frequency.size):
+                f = group_frequency[i]
+                c, s = components[1 + 2 * f, :n], components[2 + 2 * f, :n]
+                if shared[f, 0] != zero or shared[f, 1] != zero:
+                    _share_background(a, shared[f, 0], shared[f, 1], c, s)
+                into = a if f == 0 else spare
+                k0, k1, k2, k3 = group_patterns[i]
+                if exposures.size > 1:
+                    _add_four(
+                        fused[k0, :n], fused[k1, :n], fused[k2, :n], fused[k3, :n],
+                        group_weights[i], into, c, s, brightest,
+                    )  # fmt: skip
+                else:
+                    _add_four(
+                        frames[k0, v, left:right], frames[k1, v, left:right],
+                        frames[k2, v, left:right], frames[k3, v, left:right],
+                        group_weights[i], into, c, s, brightest,
+                    )  # fmt: skip
+            triangulation.interpolate_strip(planes, v / per_node, left, right, row)
+            centre = row[0, :n]
+            for x in range(n):
+                carrier[x] = centre[x] * rad_per_px
+            unwrap_row(
+                components, frequencies, beat_with, beats, phase_weight, carrier, contrast_min, dark,
+                wrapped, phase, residual, contrast,
+            )  # fmt: skip
+            c1, s1 = components[1, :n], components[2, :n]
+            if exposures.size == 1:
+                for x in range(n):
+                    e = phase[x]
+                    phase[x] = e if brightest[x] < limit else nan
+                exposed[:] = shortest
+            for x in range(n):
+                grey = a[x]
+                power = c1[x] * c1[x] + s1[x] * s1[x]
+                spread[x] = gain * (slope * grey + offset) / max(power, np.float32(1e-6))
+                # Grey values at the first exposure, whatever was fused.
+                intensity[x] = grey * shortest / max(exposed[x], shortest)
+                residual[x] = min(contrast[x], one) * max(one - residual[x], zero)
+            count += triangulation.write_row(
+                row, scale, low, high, phase, intensity, residual, spread, points[v, left:right]
+            )
     return count
 
 
@@ -235,17 +333,15 @@ class Conventional:
         per_phase = np.array([np.sum(weights[1 + 2 * i : 3 + 2 * i] ** 2) / 2 for i in range(len(self.frequencies))])
         gain = np.sum((self._phase_weight * self.frequencies[0] / self._frequencies) ** 2 * per_phase)
         self._noise = np.array((gain, *sensor.variance(bin_px)), np.float32)
-        padded = 4 * -(-len(once) // 4)
-        self._weights = np.zeros((weights.shape[0], padded), np.float32)
-        self._weights[:, : len(once)] = weights
+        self._groups = groups(once, self.frequencies)
         shape = (lookup.height, lookup.width)
         self._frames = np.zeros((self.frames, *shape), dtype if bin_px == 1 else np.float32)
         self._transposed = np.zeros(shape[::-1], np.float32)
-        self._fused = np.zeros((padded, lookup.width), np.float32)
-        self._components = np.zeros((weights.shape[0], lookup.width), np.float32)
-        self._wrapped = np.zeros((len(self.frequencies), lookup.width), np.float32)
-        self._row = np.zeros((triangulation.ROW_PLANES, lookup.width), np.float32)
-        self._scratch = np.zeros((8, lookup.width), np.float32)
+        self._fused = np.zeros((len(once), STRIP), np.float32)
+        self._components = np.zeros((weights.shape[0], STRIP), np.float32)
+        self._wrapped = np.zeros((len(self.frequencies), STRIP), np.float32)
+        self._row = np.zeros((triangulation.ROW_PLANES, STRIP), np.float32)
+        self._scratch = np.zeros((9, STRIP), np.float32)
         self.count = 0
 
     def reset(self) -> None:
@@ -280,7 +376,10 @@ class Conventional:
             self._frames,
             self._exposures,
             self.saturation_grey,
-            self._weights,
+            self._groups.frequency,
+            self._groups.patterns,
+            self._groups.weights,
+            self._groups.shared,
             self._frequencies,
             self._beat_with,
             self._beats,

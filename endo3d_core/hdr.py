@@ -7,6 +7,8 @@ fringes keep their phase, and its grey values belong to the summed exposure time
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,35 +17,38 @@ from endo3d_core.compiled import kernel
 
 @kernel
 def fuse_row(
-    frames: NDArray[np.uint8] | NDArray[np.uint16] | NDArray[np.float32],
+    frames: NDArray[Any],
     v: int,
+    left: int,
+    right: int,
     exposures: NDArray[np.float32],
     saturation: float,
     fused: NDArray[np.float32],
     exposed: NDArray[np.float32],
-    brightest: NDArray[np.float32],
+    used: NDArray[np.float32],
 ) -> None:
-    """Row v of frames (exposures * patterns, height, width) -> fused (patterns or more, width).
+    """Columns left..right of row v of frames (exposures * patterns, height, width) -> fused (patterns, columns).
 
-    ``exposed`` (width,) is the summed exposure, 0 where every exposure saturates (``fused`` is 0 there too);
-    ``brightest`` is scratch (width,).
+    ``exposed`` (columns,) is the summed exposure, 0 where every exposure saturates (``fused`` is 0 there too);
+    ``used`` is scratch (columns,).
     """
     count = exposures.size
     patterns = frames.shape[0] // count
-    limit, zero = np.float32(saturation), np.float32(0.0)
+    limit, zero, one = np.float32(saturation), np.float32(0.0), np.float32(1.0)
     exposed[:] = zero
-    fused[:] = zero
+    for p in range(patterns):
+        fused[p, : exposed.size] = zero
     for e in range(count):
-        brightest[:] = zero
+        used[:] = zero
         for p in range(patterns):
-            row = frames[e * patterns + p, v]
-            for x in range(row.size):
-                brightest[x] = max(brightest[x], np.float32(row[x]))
+            row = frames[e * patterns + p, v, left:right]
+            for x in range(used.size):
+                used[x] = max(used[x], np.float32(row[x]))
         weight = exposures[e]
-        for x in range(exposed.size):
-            brightest[x] = np.float32(1.0) if brightest[x] < limit else zero
-            exposed[x] += weight * brightest[x]
+        for x in range(used.size):
+            used[x] = one if used[x] < limit else zero
+            exposed[x] += weight * used[x]
         for p in range(patterns):
-            row, out = frames[e * patterns + p, v], fused[p]
-            for x in range(row.size):
-                out[x] += brightest[x] * np.float32(row[x])
+            row, out = frames[e * patterns + p, v, left:right], fused[p]
+            for x in range(used.size):
+                out[x] += used[x] * np.float32(row[x])

@@ -27,6 +27,7 @@ from endo3d_core.slot_check import SlotCheck
 from endo3d_core.triangulation import Lookup
 
 Form = Literal["three", "five", "reuse"]
+Planes = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]
 FRAMES: dict[Form, int] = {"three": 3, "five": 5, "reuse": 7}
 """Consecutive frames that a result needs; its stamp is the middle one's."""
 
@@ -299,9 +300,7 @@ class Interleaved:
             uncertainty.bandpass_variance(self.intensity, self.modulation, *self._grey_variance, gain, self.variance)
         unwrap.keep_smooth(self._fitted if self.fit else self._start, unwrap.NEIGHBOUR_MAX_RAD, self.phase)
 
-    def _of_both(
-        self, planes: NDArray[np.float32], before: int, centre: int, after: int
-    ) -> tuple[NDArray[np.float32], ...]:
+    def _of_both(self, planes: NDArray[np.float32], before: int, centre: int, after: int) -> Planes:
         """The two planes whose mean is f1's, and the two of f2's: the centre's alone, its neighbours'
         averaged."""
         alone, neighbours = (planes[centre], planes[centre]), (planes[before], planes[after])
@@ -317,7 +316,7 @@ class Interleaved:
             self._quarter_px,
             self.modulation,
             self.intensity,
-            tuple(SIGNAL_NOISE**2 * v for v in self._grey_variance),
+            (SIGNAL_NOISE**2 * self._grey_variance[0], SIGNAL_NOISE**2 * self._grey_variance[1]),
             self.modulation_min,
             self._fit_rows,
             self._fit_sums,

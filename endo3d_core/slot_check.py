@@ -52,7 +52,9 @@ def pair_ratio(
             row_total += (p + q) * (p + q)
             row_apart += (p - q) * (p - q)
             row_grey += a[x] + b[x]
-        total, apart, grey = total + row_total, apart + row_apart, grey + row_grey
+        total += float(row_total)
+        apart += float(row_apart)
+        grey += float(row_grey)
         count += width
     contrast = np.sqrt(max(total, apart) * count) / grey if grey > 2.0 * dark * count else 0.0
     return np.sqrt(total / max(apart, 1e-3)), contrast

@@ -112,6 +112,19 @@ def interpolate_row(planes: NDArray[np.float32], position: float, row: NDArray[n
 
 
 @kernel
+def interpolate_strip(
+    planes: NDArray[np.float32], position: float, left: int, right: int, row: NDArray[np.float32]
+) -> None:
+    """The same for columns left..right -> the first 7 of row (9, right - left or more)."""
+    node = min(int(position), planes.shape[1] - 2)
+    t = np.float32(position - node)
+    for p in range(planes.shape[0]):
+        a, b, out = planes[p, node, left:right], planes[p, node + 1, left:right], row[p]
+        for x in range(a.size):
+            out[x] = a[x] + t * (b[x] - a[x])
+
+
+@kernel
 def carrier(planes: NDArray[np.float32], per_node: float, scale: float, out: NDArray[np.float32]) -> None:
     """The mid-depth coordinate times ``scale`` -> out (height, width): phase in rad for scale = 2 pi f /
     period."""
@@ -151,10 +164,12 @@ def write_row(
         d = residual[x] * px_per_rad
         z = one / (c0[x] + d * (c1[x] + d * (c2[x] + d * c3[x])))
         slope = z * z * (c1[x] + d * (two * c2[x] + d * three * c3[x])) * px_per_rad
-        sigma = np.sqrt(slope * slope * variance[x])
         inside = (z >= z_min) & (z <= z_max)
         z_row[x] = z if inside else nan
-        s_row[x] = sigma if inside else nan
+        s_row[x] = slope * slope * variance[x]
+    for x in range(residual.size):
+        # A NaN depth makes its sigma NaN; a choice would put the root into a branch and end vectorisation.
+        s_row[x] = np.sqrt(s_row[x]) + (z_row[x] - z_row[x])
     for x in range(residual.size):
         z, q = z_row[x], quality[x]
         points[x, 0] = rx[x] * z
