@@ -100,6 +100,13 @@ def message_indexes(entries: Mapping[int, Sequence[tuple[int, int]]], at: int) -
     return bytes(out), offsets
 
 
+def index_entries(view: memoryview, at: int) -> list[tuple[int, int]]:
+    """The entries (log time, offset) of the message index at offset ``at``. Raises ``struct.error``."""
+    _, _, _, size = MESSAGE_INDEX.unpack_from(view, at)
+    start = at + MESSAGE_INDEX.size
+    return list(INDEX_ENTRY.iter_unpack(view[start : start + size]))
+
+
 def chunk_around(records: Sequence[Buffer], start_ns: int, end_ns: int) -> bytes:
     """What stands before the records of an uncompressed chunk, their CRC included."""
     size = sum(len(part) for part in records)

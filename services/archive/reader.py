@@ -203,13 +203,20 @@ class Log:
         records = self._chunk_records(index, check)
         for channel in index.index_offsets.keys() & streams.keys():
             at = index.index_offsets[channel]
-            _, _, _, size = layout.MESSAGE_INDEX.unpack_from(self._map, at)
-            at += layout.MESSAGE_INDEX.size
-            for _, offset in layout.INDEX_ENTRY.iter_unpack(self._map[at : at + size]):
-                _, length, _, sequence, log_ns, publish_ns = layout.MESSAGE.unpack_from(records, offset)
+            try:
+                entries = layout.index_entries(self._map, at)
+                heads = [(offset, layout.MESSAGE.unpack_from(records, offset)) for _, offset in entries]
+            except struct.error as error:
+                raise self._damaged(at) from error
+            for offset, (opcode, length, of_channel, sequence, log_ns, publish_ns) in heads:
                 end = offset + layout.RECORD.size + length
+                if opcode != layout.OP_MESSAGE or of_channel != channel or end > len(records):
+                    raise self._damaged(at)
                 payload = records[offset + layout.MESSAGE.size : end]
                 yield Record(streams[channel], sequence, log_ns, publish_ns, payload)
+
+    def _damaged(self, at: int) -> Unreadable:
+        return Unreadable(f"{self.path} is damaged at byte {at}: endo3d recover {self.path}")
 
     def _fetch_ahead(self, chosen: Sequence[ChunkIndex]) -> None:
         """Have the kernel read small chunks all at once: one by one a disk's latency would add up."""
@@ -228,7 +235,7 @@ class Log:
         records = self._map[index.records_offset : index.records_offset + index.size]
         expected = layout.CHUNK.unpack_from(self._map, index.offset)[5]
         if check and expected and zlib.crc32(records) != expected:
-            raise Unreadable(f"{self.path} is damaged at byte {index.offset}: endo3d recover {self.path}")
+            raise self._damaged(index.offset)
         return records
 
     def _summary_start(self) -> int:

@@ -63,7 +63,7 @@ def recover(path: Path, out: Path | None = None) -> Report:
         _lock(file.fileno(), path)
         view = _mapped(file.fileno(), path)
         inventory = _inventory(view, path)
-        if out is None and not inventory.damages and is_whole(path):
+        if out is None and not inventory.damages and not inventory.unindexed and is_whole(path):
             return inventory.report(path, 0, was_whole=True)
         if out is None and inventory.repairable:
             _append_summary(file.fileno(), inventory)

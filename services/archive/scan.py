@@ -6,6 +6,7 @@ import struct
 import zlib
 from collections import defaultdict
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
 from io import BytesIO
 from typing import NamedTuple
@@ -89,8 +90,7 @@ def walk(view: memoryview) -> Iterator[Found | FoundChunk | Damage]:
         opcode, length = layout.RECORD.unpack_from(view, at)
         body_at, end = at + layout.RECORD.size, at + layout.RECORD.size + length
         if opcode == Opcode.MESSAGE_INDEX and chunk is not None and end <= len(view):
-            _, _, channel, _ = layout.MESSAGE_INDEX.unpack_from(view, at)
-            chunk.index_offsets[channel] = at
+            _note_index(chunk, view, at)
             chunk.index_length = end - chunk.offset - chunk.length
             at = end
             continue
@@ -135,6 +135,14 @@ def _read(view: memoryview, at: int, opcode: int, body_at: int, end: int) -> Fou
     except (McapError, ValueError, struct.error) as error:
         return Damage(at, f"unreadable: {error}")
     return None
+
+
+def _note_index(chunk: FoundChunk, view: memoryview, at: int) -> None:
+    """Take a message index, unless it says something else than the chunk."""
+    with suppress(struct.error):
+        _, _, channel, _ = layout.MESSAGE_INDEX.unpack_from(view, at)
+        if layout.index_entries(view, at) == chunk.entries.get(channel):
+            chunk.index_offsets[channel] = at
 
 
 def _chunk(body: memoryview, at: int, length: int) -> FoundChunk | Damage:

@@ -89,6 +89,14 @@ def test_results_into_a_log_that_replays_further(log: Path, tmp_path: Path) -> N
     assert same_again.read_bytes() == out.read_bytes()
 
 
+def test_a_cropped_and_packed_log_decodes_to_the_same_bits(log: Path, tmp_path: Path) -> None:
+    """The virtual camera sees nothing outside of the image circle, so nothing is lost."""
+    head = str(engine.stack_file.stock("heads")["base6_wd20"])
+    packed = write(tmp_path / "packed.mcap", FRAMES, BIN_PX, crop=True, compact=True, head=head)
+    assert packed.stat().st_size < 0.6 * log.stat().st_size
+    assert run(packed, "--only", "decoder")["digests"] == run(log, "--only", "decoder")["digests"]
+
+
 def test_a_part_of_the_log(log: Path) -> None:
     late = run(log, "--only", "decoder", "--from", "0.03")
     assert 0 < late["results"]["cloud"] < run(log, "--only", "decoder")["results"]["cloud"]
