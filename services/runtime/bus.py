@@ -128,7 +128,9 @@ class Bus:
     def close(self) -> None:
         """Stop reading, then leave. Arrays that were loaned or received are void from now on."""
         self.stop_reading()
-        self._memory = None
+        if self._memory is not None:
+            self._memory.settle()
+            self._memory = None
         try:
             self._session.close()
         except zenoh.ZError as error:  # a connection attempt that hangs
@@ -175,19 +177,13 @@ class Bus:
 
         self.subscribe_encoded(topic, deliver, newest=newest)
 
-    def subscribe_encoded(
-        self, topic: Topic, handler: Callable[[Sample], None], *, newest: bool = False
-    ) -> None:
+    def subscribe_encoded(self, topic: Topic, handler: Callable[[Sample], None], *, newest: bool = False) -> None:
         """The same with samples as they travelled."""
         if topic.bulk and self._view is not None:
             self._declared.append(
-                mapping.map_offered(
-                    self._session, mapping.key(self.rig, topic), lambda: self._can_not_map(topic)
-                )
+                mapping.map_offered(self._session, mapping.key(self.rig, topic), lambda: self._can_not_map(topic))
             )
-        reader = Reader(
-            self._session, topic.key(self.rig), topic, handler, self._view, self.tally, newest=newest
-        )
+        reader = Reader(self._session, topic.key(self.rig), topic, handler, self._view, self.tally, newest=newest)
         self._readers.append(reader)
         reader.start()
 

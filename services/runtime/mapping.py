@@ -21,9 +21,7 @@ def key(rig: str, topic: Topic) -> str:
     return f"endo3d/{rig}/pool/{topic.name}"
 
 
-def offer(
-    session: zenoh.Session, key: str, piece: zenoh.ZBytes
-) -> tuple[zenoh.Queryable[None], zenoh.LivelinessToken]:
+def offer(session: zenoh.Session, key: str, piece: zenoh.ZBytes) -> tuple[zenoh.Queryable[None], zenoh.LivelinessToken]:
     """Let readers map the pool that ``piece`` is of, now and later."""
 
     def answer(query: zenoh.Query) -> None:
@@ -37,16 +35,18 @@ def map_offered(session: zenoh.Session, key: str, fail: Callable[[], None]) -> z
     """Map the pools that are offered, now and from now on; ``fail`` is called when that can't be."""
 
     def take(token: zenoh.Sample) -> None:
-        if token.kind == zenoh.SampleKind.PUT and not _ask(session, key):
+        if token.kind == zenoh.SampleKind.PUT and not _ask(session, key) and _is_offered(session, key):
             fail()
 
     _ask(session, key)
     return session.liveliness().declare_subscriber(key, take, history=True)
 
 
+def _is_offered(session: zenoh.Session, key: str) -> bool:
+    return sum(reply.ok is not None for reply in session.liveliness().get(key, timeout=_ASK_S)) > 0
+
+
 def _ask(session: zenoh.Session, key: str) -> bool:
     """Receiving a piece maps its pool. Whether any came."""
-    pieces = session.get(
-        key, target=zenoh.QueryTarget.ALL, consolidation=zenoh.ConsolidationMode.NONE, timeout=_ASK_S
-    )
+    pieces = session.get(key, target=zenoh.QueryTarget.ALL, consolidation=zenoh.ConsolidationMode.NONE, timeout=_ASK_S)
     return sum(reply.ok is not None for reply in pieces) > 0

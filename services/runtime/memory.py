@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import threading
+import time
 from collections.abc import Callable
 from typing import Any, Final
 
@@ -22,6 +23,7 @@ _SMALL_BYTES: Final = 3_072
 """Below this a message travels in the descriptor's place, which is cheaper than a chunk."""
 _COMMON_CHUNK_BYTES: Final = 1 << 20
 """Of the pool for everything that is neither small nor bulk: map deltas, calibrations."""
+_SETTLE_S: Final = 0.5
 _PIECE_BYTES: Final = 64
 """Of every new pool, offered to readers to map it by."""
 
@@ -37,6 +39,8 @@ class Memory:
         self._view = view
         self._offer = offer
         self._pools: dict[Topic | None, Pool] = {}
+        self._whole: dict[Topic | None, int] = {}
+        """Chunks of each pool when none is in use."""
         self._lock = threading.Lock()
 
     def lend(self, topic: Topic, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
@@ -68,6 +72,18 @@ class Memory:
         chunk.array()[:] = np.frombuffer(encoded, np.uint8)
         return seal(chunk)
 
+    def settle(self) -> None:
+        """Wait until readers have let go of what was published, for half a second at most.
+
+        Shared memory ends with its process: a reader that is woken later would find nothing.
+        """
+        deadline = time.monotonic() + _SETTLE_S
+        while time.monotonic() < deadline and self._is_looked_at():
+            time.sleep(_SETTLE_S / 50)
+
+    def _is_looked_at(self) -> bool:
+        return any(pool.free() < self._whole[key] for key, pool in self._pools.items())
+
     def _pool(self, topic: Topic, size: int) -> Pool:
         """The topic's own pool, replaced when its messages outgrow it; or the common one."""
         key = topic if topic.bulk else None
@@ -77,6 +93,7 @@ class Memory:
                 pool = self._pools[key] = Pool(size if topic.bulk else _COMMON_CHUNK_BYTES, self._view)
                 if topic.bulk:
                     self._offer(topic, seal(pool.take(_PIECE_BYTES)))
+                self._whole[key] = pool.free()
             return pool
 
 

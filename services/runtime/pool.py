@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 from typing import Final
 
@@ -42,6 +43,14 @@ class Pool:
         except ZError as error:
             raise Exhausted(str(error)) from None
         return copy_of(owner, size) if self._view is None else self._view(owner, size)
+
+    def free(self) -> int:
+        """How many chunks could be had now: all but those that somebody writes or looks at."""
+        chunks: list[Chunk] = []
+        with contextlib.suppress(Exhausted):
+            while True:
+                chunks.append(self.take(self.chunk_bytes))
+        return len(chunks)
 
 
 def is_loan(chunk: Chunk) -> bool:

@@ -50,18 +50,14 @@ class Reader(threading.Thread):
         self._view = view
         self._tally = tally
         self._newest = newest
-        self._expected: dict[str, int] = {}
+        self._expected: dict[tuple[zenoh.ZenohId, int], int] = {}
         self._chunks: weakref.WeakSet[Chunk] = weakref.WeakSet()
         self._subscriber = _subscribe(session, key, topic, 1 if newest else topic.depth)
 
     def run(self) -> None:
         with contextlib.suppress(zenoh.ZError):  # the ring is closed
-            for sample in self._subscriber.handler:
-                try:
-                    self._take(sample)
-                except Exception:
-                    self._tally.drop(self._topic.name, "failed")
-                    log.exception("reading %s goes on after this", self._topic.name)
+            while True:
+                self._take(self._subscriber.handler.recv())  # in no variable: it would hold its memory
 
     def close(self) -> None:
         """Ends the thread after the sample it works on."""
@@ -74,6 +70,13 @@ class Reader(threading.Thread):
         return all(chunk.is_valid() for chunk in tuple(self._chunks))
 
     def _take(self, sample: zenoh.Sample) -> None:
+        try:
+            self._deliver_content(sample)
+        except Exception:
+            self._tally.drop(self._topic.name, "failed")
+            log.exception("reading %s goes on after this", self._topic.name)
+
+    def _deliver_content(self, sample: zenoh.Sample) -> None:
         received_ns = time.time_ns()
         topic = self._topic.name
         self._tally.receive(topic)
@@ -99,7 +102,7 @@ class Reader(threading.Thread):
         source = sample.source_info
         if source is None:
             return 0
-        writer = f"{source.source_id.zid}/{source.source_id.eid}"
+        writer = source.source_id.zid, source.source_id.eid
         sequence: int = source.source_sn
         missed = (sequence - self._expected.get(writer, sequence)) % _SEQUENCES
         self._expected[writer] = sequence + 1

@@ -442,6 +442,19 @@ def test_what_a_killed_process_left_goes_with_the_next_start(rig: str) -> None:
         assert [path for path in left if os.path.exists(path)] == []
 
 
+def test_what_is_published_last_arrives(rig: str) -> None:
+    """A writer that ends at once keeps its shared memory until its readers have what it published."""
+    with Peer(read_frames, rig, {}, 0.01) as reader:
+        reader.hear()
+        for sequence in range(3):
+            with Bus.open(rig, name="writer") as bus:
+                wait_for(bus, "reader")
+                bus.publish(frame(bus, sequence))
+        sequences, broken, _ = reader.ask(("until", 2))
+        assert sequences == [0, 1, 2]
+        assert broken == 0
+
+
 # ---------------------------------------------------------------- ports
 
 
