@@ -10,17 +10,22 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from endo3d.schemas import topics
 from endo3d.schemas.messages import Frame, Message, Mode, ServiceState, Status, Truth
 from endo3d.services.archive.reader import Log, Record
+from endo3d.services.runtime.errors import UserError
 from endo3d.services.runtime.service import Config, Refused, Source
 
 _NEVER_NS = 1 << 63
 EPOCHS_PER_PASS = 1 << 16
 LINGER_NS = 500_000_000
 """After the last message: it lies in memory of this process, and readers need a moment to take it."""
+
+
+PLAYED = (topics.CAMERA, topics.PROJECTOR, topics.MODE, topics.FRAME, topics.TRUTH)
+"""What a camera and its projector write."""
 
 
 class PlayerConfig(Config):
@@ -34,11 +39,20 @@ class PlayerConfig(Config):
     start_s: float = Field(default=0.0, ge=0)
     end_s: float = Field(default=math.inf, gt=0)
     """What part of the log, in seconds from its start."""
-    topics: tuple[str, ...] = ("frame", "mode", "calibration/camera", "calibration/projector", "truth")
+    topics: tuple[str, ...] = tuple(topic.name for topic in PLAYED)
+    """What of the log is played."""
     after: tuple[str, ...] = ()
     """Services that have to be ready before anything is played: a camera would run on, a log would be lost."""
     restamp: bool = True
     """Stamps become the time of playing, so that latencies count from now; else they stay as recorded."""
+
+    @field_validator("topics")
+    @classmethod
+    def _playable(cls, names: tuple[str, ...]) -> tuple[str, ...]:
+        known = [topic.name for topic in PLAYED]
+        if unknown := set(names) - set(known):
+            raise ValueError(f"can't play {', '.join(sorted(unknown))}; a camera writes {', '.join(known)}")
+        return names
 
 
 class Player(Source[PlayerConfig]):
@@ -47,7 +61,7 @@ class Player(Source[PlayerConfig]):
     Config = PlayerConfig
     reads = (topics.STATUS,)
     optional = reads
-    writes = (topics.CAMERA, topics.PROJECTOR, topics.MODE, topics.FRAME, topics.TRUTH)
+    writes = PLAYED
     commands: ClassVar[tuple[str, ...]] = ("seek", "rate")
 
     now_ns: Callable[[], int] = staticmethod(time.time_ns)
@@ -56,10 +70,7 @@ class Player(Source[PlayerConfig]):
 
     def __init__(self, config: PlayerConfig) -> None:
         super().__init__(config)
-        names = {topic.name: topic for topic in self.writes}
-        if unknown := set(config.topics) - names.keys():
-            raise ValueError(f"can't play {', '.join(sorted(unknown))}; a camera writes {', '.join(names)}")
-        self._topics = [names[name] for name in config.topics]
+        self._topics = [topic for topic in PLAYED if topic.name in config.topics]
         self._rate = config.rate
         self._awaited = set(config.after)
         self._records: Iterator[Record] = iter(())
@@ -77,9 +88,12 @@ class Player(Source[PlayerConfig]):
         self._sequence_shift: int | None = None
 
     def open(self) -> None:
-        """Raises ``Unreadable`` (a missing, torn or foreign file)."""
+        """Raises ``UserError``: a missing, torn or foreign file, a start behind its end."""
         self._log = Log(self.config.log)
-        self._seek(self.config.start_s)
+        try:
+            self._seek(self.config.start_s)
+        except Refused as refused:
+            raise UserError(f"start_s = {self.config.start_s}: {refused}") from refused
 
     def step(self, message: Message) -> Iterator[Message]:
         if isinstance(message, Status) and message.state in (ServiceState.READY, ServiceState.RUNNING):

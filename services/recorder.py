@@ -13,7 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from endo3d.schemas import codec, topics
 from endo3d.schemas.messages import Frame, Message
@@ -61,6 +61,13 @@ class RecorderConfig(Config):
     head: str = ""
     stack_toml: str = ""
 
+    @field_validator("log_hz")
+    @classmethod
+    def _of_topics(cls, rates: dict[str, float]) -> dict[str, float]:
+        if unknown := rates.keys() - topics.BY_NAME.keys():
+            raise ValueError(f"no topic {', '.join(sorted(unknown))}; known are {', '.join(topics.BY_NAME)}")
+        return rates
+
 
 class Recorder(Tap[RecorderConfig]):
     """Samples -> queue -> MCAP. Never blocks: what the disk can't take is dropped and counted."""
@@ -72,10 +79,6 @@ class Recorder(Tap[RecorderConfig]):
 
     def __init__(self, config: RecorderConfig) -> None:
         super().__init__(config)
-        unknown = config.log_hz.keys() - topics.BY_NAME.keys()
-        if unknown:
-            known = ", ".join(topics.BY_NAME)
-            raise ValueError(f"log_hz: no topic {', '.join(sorted(unknown))}; known are {known}")
         self._kinds = {topic.name: Kind(*codec.schema(topic)) for topic in self.reads}
         self._period_ns = {topic.name: _period_ns(config.log_hz.get(topic.name, topic.log_hz)) for topic in self.reads}
         self._due_ns: dict[str, int] = {}

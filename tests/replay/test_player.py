@@ -15,6 +15,7 @@ from endo3d.schemas import topics
 from endo3d.schemas.messages import Frame, Message, Mode, ServiceState, Status, Truth
 from endo3d.services.archive.reader import Log, Unreadable
 from endo3d.services.player import LINGER_NS, Player, PlayerConfig
+from endo3d.services.runtime.errors import UserError
 from endo3d.services.runtime.service import Refused
 
 NOW_NS = 5_000_000_000_000_000_000
@@ -178,7 +179,9 @@ def test_nothing_is_played_before_the_others_are_ready(log: Path) -> None:
 
 def test_what_cannot_be_played(tmp_path: Path, log: Path) -> None:
     with pytest.raises(ValueError, match="can't play cloud"):
-        Player(PlayerConfig(log=log, topics=("cloud",)))
+        PlayerConfig(log=log, topics=("cloud",))
+    with pytest.raises(UserError, match=r"start_s = 99.0: the log is 0.1 s long"):
+        Player(PlayerConfig(log=log, start_s=99)).open()
     torn = tmp_path / "torn.mcap"
     torn.write_bytes(log.read_bytes()[:-1])
     with pytest.raises(Unreadable, match="endo3d recover"):

@@ -100,7 +100,7 @@ def test_a_rate_holds_whatever_the_jitter(tmp_path: Path, jitter: list[int]) -> 
 
 def test_an_unknown_topic_in_the_rates_is_refused() -> None:
     with pytest.raises(ValueError, match="no topic frames; known are frame"):
-        Recorder(RecorderConfig(log_hz={"frames": 1}))
+        RecorderConfig(log_hz={"frames": 1})
 
 
 def test_start_and_stop(tmp_path: Path) -> None:
