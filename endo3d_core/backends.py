@@ -126,7 +126,7 @@ class SmallGicp:
     def register(self, points: Array) -> tuple[Array, Array]:
         import small_gicp
 
-        cloud, tree = small_gicp.preprocess_points(
+        cloud, _ = small_gicp.preprocess_points(
             points, downsampling_resolution=self._voxel_mm / 3, num_neighbors=self._neighbours, num_threads=1
         )
         information = np.zeros((6, 6))

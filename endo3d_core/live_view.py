@@ -30,11 +30,8 @@ class LiveView:
         """The pooled grid's rays."""
         self.sigma_mm = np.nan
         """Typical 1-sigma of a pooled point along its ray."""
-        self.depth_mm = np.nan
-        """Typical z."""
         self.pitch_mm = np.nan
         """Typical distance of neighbouring pooled points."""
-
 
     def load(self, channels: NDArray[np.float32]) -> int:
         """(height, width, 6) float32 x y z intensity quality sigma -> the number of valid pooled cells.
@@ -43,7 +40,7 @@ class LiveView:
         """
         self._learn_rays(channels)
         assert self.rays is not None
-        pitch_mm = self._centre_depth(channels) / self.rays.focal_cells
+        pitch_mm = _typical(channels[..., 2]) / self.rays.focal_cells
         self.count = pooling.pool(channels, STEEPEST * pitch_mm, self._planes)
         if self.count == 0:
             return 0
@@ -51,10 +48,9 @@ class LiveView:
         pooling.high_pass(self._planes, half, self._work)
         self.pitch_mm = POOL * pitch_mm
         normals.slopes(self._planes[pooling.Z], 2 * STEEPEST * self.pitch_mm, self._slopes)
-        grey = float(np.nanmedian(self._planes[pooling.INTENSITY, ::5, ::5]))
+        grey = _typical(self._planes[pooling.INTENSITY])
         normals.gather(self._planes, self._slopes, self.coefficients, grey, self.live)
-        self.sigma_mm = float(np.nanmedian(self._planes[pooling.SIGMA, ::5, ::5]))
-        self.depth_mm = float(np.nanmedian(self._planes[pooling.Z, ::5, ::5]))
+        self.sigma_mm = _typical(self._planes[pooling.SIGMA])
         return self.count
 
     @property
@@ -77,9 +73,9 @@ class LiveView:
         self._work = np.empty((4, columns + 1), np.float64)
         self.live = np.empty((rows, columns, normals.LIVE), np.float32)
 
-    @staticmethod
-    def _centre_depth(channels: NDArray[np.float32]) -> float:
-        depth = channels[::9, ::9, 2]
-        depth = depth[np.isfinite(depth)]
-        return float(np.median(depth)) if depth.size else 1.0
 
+def _typical(plane: NDArray[np.float32], stride: int = 8) -> float:
+    """The median of every ``stride``th row and column, or 1 where all is NaN."""
+    values = plane[::stride, ::stride].ravel()
+    values = values[values == values]
+    return float(np.median(values)) if values.size else 1.0

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,10 +35,12 @@ ROW = 16
 KEY, PUBLISHED = 0, 3  # of the tag
 TAG = 4
 
-CONFIRMED = 4
+CONFIRMED = 8
 """Measured points from which on a map point is believed and published."""
 _OUTLIER_AGE = 60
 """Clouds after which a map point that is still unconfirmed is an outlier (a third of a second)."""
+_CROWDED = 0.95
+"""Share of the capacity from which on the points seen longest ago are forgotten."""
 _SWEPT = 4096
 """Rows looked at for eviction per cloud: a fixed cost instead of a pause."""
 _MOVED_MM = 0.002
@@ -73,7 +76,7 @@ class MergedMap:
         self._dirty = np.empty(capacity, np.int32)
         self._removed = np.empty((capacity, 3), np.int16)
         self._touched = np.empty(1, np.int32)
-        self._counters = np.zeros(7, np.int64)
+        self._counters = np.zeros(8, np.int64)
         self.clear()
 
     def clear(self) -> None:
@@ -81,7 +84,8 @@ class MergedMap:
         self.ints[: self.used, COUNT] = 0
         self._counters[:] = 0
 
-    # The kernels' counters: rows ever used, free rows, dirty rows, removed keys, touched rows, sweep position, refused.
+    # The kernels' counters: rows ever used, free rows, dirty rows, removed keys, touched rows, sweep position, refused
+    # points, first cloud.
     @property
     def used(self) -> int:
         """Rows in use or free again: every live row lies below."""
@@ -104,6 +108,8 @@ class MergedMap:
 
     def merge(self, live: NDArray[np.float32], T_world_camera: NDArray[np.float64], sequence: int) -> None:
         """Merges the points of ``live`` (rows, columns, LIVE), seen from a pose (4, 4), as cloud ``sequence``."""
+        if self.count == 0:
+            self._counters[7] = sequence
         if self._touched.size < live.shape[0] * live.shape[1]:
             self._touched = np.empty(live.shape[0] * live.shape[1], np.int32)
         _merge(
@@ -126,7 +132,7 @@ class MergedMap:
 
     def take_delta(self) -> Delta:
         """What is new, moved by more than 2 um or doubled its count since the last call."""
-        dirty = self._dirty[: self._counters[2]]
+        dirty = np.unique(self._dirty[: self._counters[2]])
         dirty = dirty[self.ints[dirty, COUNT] >= CONFIRMED]
         delta = Delta(self._published(dirty), self._removed[: self._counters[3]].copy())
         _mark_published(dirty, self.ints, self._tags, self._moved)
@@ -147,9 +153,10 @@ class MergedMap:
 
 
 @kernel
-def _along_axis(keys, index, rows, kx, ky, kz, axis, place, d):  # type: ignore[no-untyped-def]
+def _along_axis(keys: Any, index: Any, rows: Any, kx: Any, ky: Any, kz: Any, axis: Any, place: Any, d: Any) -> Any:
     """The row of the voxel before or behind along ``axis`` whose point lies within d of ``place``, or -1."""
-    best, best_gap = np.int64(-1), np.float32(d)
+    best: Any = np.int64(-1)
+    best_gap = np.float32(d)
     for step in (-1, 1):
         key = voxel_hash.pack(
             kx + (step if axis == 0 else 0), ky + (step if axis == 1 else 0), kz + (step if axis == 2 else 0)
@@ -163,9 +170,10 @@ def _along_axis(keys, index, rows, kx, ky, kz, axis, place, d):  # type: ignore[
 
 
 @kernel
-def _merge(  # type: ignore[no-untyped-def]
-    live, T, d, sequence, keys, index, rows, ints, tags, moved, free, dirty, touched, counters
-):
+def _merge(
+    live: Any, T: Any, d: Any, sequence: Any, keys: Any, index: Any, rows: Any, ints: Any, tags: Any, moved: Any,
+    free: Any, dirty: Any, touched: Any, counters: Any,
+) -> None:  # fmt: skip
     r00, r01, r02, tx = np.float32(T[0, 0]), np.float32(T[0, 1]), np.float32(T[0, 2]), np.float32(T[0, 3])
     r10, r11, r12, ty = np.float32(T[1, 0]), np.float32(T[1, 1]), np.float32(T[1, 2]), np.float32(T[1, 3])
     r20, r21, r22, tz = np.float32(T[2, 0]), np.float32(T[2, 1]), np.float32(T[2, 2]), np.float32(T[2, 3])
@@ -175,24 +183,24 @@ def _merge(  # type: ignore[no-untyped-def]
     elif abs(r12) > abs(r22):
         axis = 1
     per_voxel, one = np.float32(1.0 / d), np.float32(1.0)
-    counters[4] = 0
+    offset, two_offsets = np.float32(32768.0), np.float32(65534.0)
+    touches, waiting, refused = 0, counters[2], counters[6]
     for r in range(live.shape[0]):
         for c in range(live.shape[1]):
             p = live[r, c]
-            if not p[2] == p[2]:
+            if np.isnan(p[2]):
                 continue
             x = r00 * p[0] + r01 * p[1] + r02 * p[2] + tx
             y = r10 * p[0] + r11 * p[1] + r12 * p[2] + ty
             z = r20 * p[0] + r21 * p[1] + r22 * p[2] + tz
-            kx, ky, kz = (
-                np.int64(math.floor(x * per_voxel)), np.int64(math.floor(y * per_voxel)),
-                np.int64(math.floor(z * per_voxel)),
-            )  # fmt: skip
-            if max(abs(kx), abs(ky), abs(kz)) >= voxel_hash.KEY_LIMIT:
-                counters[6] += 1
+            # Positive, so that cutting off the fraction rounds down.
+            fx, fy, fz = x * per_voxel + offset, y * per_voxel + offset, z * per_voxel + offset
+            if not (one < min(fx, min(fy, fz)) and max(fx, max(fy, fz)) < two_offsets):
+                refused += 1
                 continue
+            kx, ky, kz = np.int64(fx) - 32768, np.int64(fy) - 32768, np.int64(fz) - 32768
             key = voxel_hash.pack(kx, ky, kz)
-            row = voxel_hash.find(keys, index, key)
+            row: Any = voxel_hash.find(keys, index, key)
             if row < 0:
                 row = _along_axis(keys, index, rows, kx, ky, kz, axis, x if axis == 0 else (y if axis == 1 else z), d)
             if row < 0:
@@ -203,7 +211,7 @@ def _merge(  # type: ignore[no-untyped-def]
                     row = counters[0]
                     counters[0] += 1
                 else:
-                    counters[6] += 1
+                    refused += 1
                     continue
                 voxel_hash.insert(keys, index, key, row)
                 rows[row] = np.float32(0.0)
@@ -225,7 +233,11 @@ def _merge(  # type: ignore[no-untyped-def]
                 nz = r20 * p[3] + r21 * p[4] + r22 * p[5]
                 fresh = point[3] * point[3] + point[4] * point[4] + point[5] * point[5] == np.float32(0.0)
                 blend = one if fresh else share
-                nx, ny, nz = point[3] + blend * (nx - point[3]), point[4] + blend * (ny - point[4]), point[5] + blend * (nz - point[5])
+                nx, ny, nz = (
+                    point[3] + blend * (nx - point[3]),
+                    point[4] + blend * (ny - point[4]),
+                    point[5] + blend * (nz - point[5]),
+                )
                 scale = one / np.sqrt(nx * nx + ny * ny + nz * nz)
                 point[3], point[4], point[5] = nx * scale, ny * scale, nz * scale
             off = point[3] * dx + point[4] * dy + point[5] * dz
@@ -240,19 +252,21 @@ def _merge(  # type: ignore[no-untyped-def]
             ints[row, COUNT] += 1
             if ints[row, LAST] != sequence:
                 ints[row, LAST] = sequence
-                touched[counters[4]] = row
-                counters[4] += 1
+                touched[touches] = row
+                touches += 1
             # Published holds twice the exponent of the last published count, plus one while the row waits.
             state = np.int64(tags[row, PUBLISHED])
-            if (state & 1) == 0 and ints[row, COUNT] >= CONFIRMED:
-                if (ints[row, COUNT] >> (state >> 1)) > 1 or abs(moved[row]) > np.float32(_MOVED_MM) or state == 0:
-                    tags[row, PUBLISHED] = state | 1
-                    dirty[counters[2]] = row
-                    counters[2] += 1
+            doubled = (ints[row, COUNT] >> (state >> 1)) > 1
+            changed = state == 0 or doubled or abs(moved[row]) > np.float32(_MOVED_MM)
+            if (state & 1) == 0 and ints[row, COUNT] >= CONFIRMED and changed and waiting < dirty.size:
+                tags[row, PUBLISHED] = state | 1
+                dirty[waiting] = row
+                waiting += 1
+    counters[4], counters[2], counters[6] = touches, waiting, refused
 
 
 @kernel
-def _mark_published(dirty, ints, tags, moved):  # type: ignore[no-untyped-def]
+def _mark_published(dirty: Any, ints: Any, tags: Any, moved: Any) -> Any:
     for i in range(dirty.size):
         row = dirty[i]
         exponent = 0
@@ -263,13 +277,26 @@ def _mark_published(dirty, ints, tags, moved):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _sweep(sequence, amount, keys, index, ints, tags, free, removed, counters):  # type: ignore[no-untyped-def]
-    """Looks at the next ``amount`` rows and evicts those that were never confirmed (section 3.3: outliers)."""
+def _sweep(
+    sequence: Any, amount: Any, keys: Any, index: Any, ints: Any, tags: Any, free: Any, removed: Any, counters: Any
+) -> None:  # fmt: skip
+    """Looks at the next ``amount`` rows and evicts those that were never confirmed (section 3.3: outliers).
+
+    In a map that is nearly full, also what was not seen during the later half of the scan.
+    """
     used = counters[0]
+    crowded = used - counters[1] > _CROWDED * ints.shape[0]
     for _ in range(amount):
         row = counters[5]
         counters[5] = row + 1 if row + 1 < used else 0
-        if 0 < ints[row, COUNT] < CONFIRMED and sequence - ints[row, LAST] > _OUTLIER_AGE:
+        if ints[row, COUNT] == 0:
+            continue
+        outlier = ints[row, COUNT] < CONFIRMED and sequence - ints[row, LAST] > _OUTLIER_AGE
+        forgotten = crowded and 2 * ints[row, LAST] < sequence + counters[7]
+        if outlier or forgotten:
+            if tags[row, PUBLISHED] > 0 and counters[3] < removed.shape[0]:
+                removed[counters[3]] = tags[row, :3]
+                counters[3] += 1
             voxel_hash.remove(
                 keys, index,
                 voxel_hash.pack(np.int64(tags[row, 0]), np.int64(tags[row, 1]), np.int64(tags[row, 2])),

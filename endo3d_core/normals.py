@@ -7,6 +7,8 @@ along it.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -22,7 +24,7 @@ intensity; the square of the surroundings' brightness, relative to the whole clo
 
 
 @kernel
-def _pair(ahead, behind, z, reach):  # type: ignore[no-untyped-def]
+def _pair(ahead: Any, behind: Any, z: Any, reach: Any) -> Any:
     """(1, half the difference) of two opposite cells on the centre's surface, else (0, 0)."""
     near = (abs(ahead - z) <= reach) & (abs(behind - z) <= reach)
     one, zero = np.float32(1.0), np.float32(0.0)
@@ -44,32 +46,78 @@ def slopes(depth: NDArray[np.float32], reach_mm: float, out: NDArray[np.float32]
         for c in range(depth.shape[1] - 4):
             z = z2[c + 2]
             uu = uv = vv = uz = vz = count = zero
-            # fmt: off
             k, g = _pair(z2[c + 3], z2[c + 1], z, reach)
-            uu += k; uz += g; count += k
+            uu += k
+            uz += g
+            count += k
             k, g = _pair(z2[c + 4], z2[c], z, reach)
-            uu += four * k; uz += two * g; count += k
+            uu += four * k
+            uz += two * g
+            count += k
             k, g = _pair(z3[c + 2], z1[c + 2], z, reach)
-            vv += k; vz += g; count += k
+            vv += k
+            vz += g
+            count += k
             k, g = _pair(z4[c + 2], z0[c + 2], z, reach)
-            vv += four * k; vz += two * g; count += k
+            vv += four * k
+            vz += two * g
+            count += k
             k, g = _pair(z3[c + 3], z1[c + 1], z, reach)
-            uu += k; uv += k; vv += k; uz += g; vz += g; count += k
+            uu += k
+            uv += k
+            vv += k
+            uz += g
+            vz += g
+            count += k
             k, g = _pair(z3[c + 1], z1[c + 3], z, reach)
-            uu += k; uv -= k; vv += k; uz -= g; vz += g; count += k
+            uu += k
+            uv -= k
+            vv += k
+            uz -= g
+            vz += g
+            count += k
             k, g = _pair(z3[c + 4], z1[c], z, reach)
-            uu += four * k; uv += two * k; vv += k; uz += two * g; vz += g; count += k
+            uu += four * k
+            uv += two * k
+            vv += k
+            uz += two * g
+            vz += g
+            count += k
             k, g = _pair(z3[c], z1[c + 4], z, reach)
-            uu += four * k; uv -= two * k; vv += k; uz -= two * g; vz += g; count += k
+            uu += four * k
+            uv -= two * k
+            vv += k
+            uz -= two * g
+            vz += g
+            count += k
             k, g = _pair(z4[c + 3], z0[c + 1], z, reach)
-            uu += k; uv += two * k; vv += four * k; uz += g; vz += two * g; count += k
+            uu += k
+            uv += two * k
+            vv += four * k
+            uz += g
+            vz += two * g
+            count += k
             k, g = _pair(z4[c + 1], z0[c + 3], z, reach)
-            uu += k; uv -= two * k; vv += four * k; uz -= g; vz += two * g; count += k
+            uu += k
+            uv -= two * k
+            vv += four * k
+            uz -= g
+            vz += two * g
+            count += k
             k, g = _pair(z4[c + 4], z0[c], z, reach)
-            uu += four * k; uv += four * k; vv += four * k; uz += two * g; vz += two * g; count += k
+            uu += four * k
+            uv += four * k
+            vv += four * k
+            uz += two * g
+            vz += two * g
+            count += k
             k, g = _pair(z4[c], z0[c + 4], z, reach)
-            uu += four * k; uv -= four * k; vv += four * k; uz -= two * g; vz += two * g; count += k
-            # fmt: on
+            uu += four * k
+            uv -= four * k
+            vv += four * k
+            uz -= two * g
+            vz += two * g
+            count += k
             scale = np.float32(1.0) / (uu * vv - uv * uv) if count >= np.float32(6.0) else np.float32(np.nan)
             slope_u[c + 2] = (vv * uz - uv * vz) * scale
             slope_v[c + 2] = (uu * vz - uv * uz) * scale

@@ -90,9 +90,8 @@ class Odometry:
             estimate = self._begin(stamp_ns)
             self._merge(sequence)
             return estimate
-        estimate = None if self._failures else self._register(self._predict(stamp_ns), stamp_ns)
-        if estimate is None:
-            estimate = self._recover(sequence, stamp_ns)
+        known = None if self._failures else self._register(self._predict(stamp_ns), stamp_ns)
+        estimate = known or self._recover(stamp_ns)
         if estimate.state is not State.LOST and estimate.state is not State.RELOCALISED:
             self._merge(sequence)
         return estimate
@@ -132,7 +131,7 @@ class Odometry:
             return self.T_world_camera
         return self.T_world_camera @ rigid.exp(self._velocity * (stamp_ns - self._last_ns))
 
-    def _recover(self, sequence: int, stamp_ns: int) -> Estimate:
+    def _recover(self, stamp_ns: int) -> Estimate:
         """Wide search against the map; a new one when that keeps failing, or at once if there is hardly one yet."""
         self._failures += 1
         found = recover(self.view, self.map, self.T_world_camera, self._equations)
@@ -175,9 +174,7 @@ class Odometry:
         self._advance(rigid.orthonormal(T), stamp_ns, solution.held, frame)
         return self._estimate(State.DEGENERATE if solution.held.size else State.TRACKING, n, solution, frame)
 
-    def _estimate(
-        self, state: State, n: NormalEquations, solution: health.Solution, frame: Frame6
-    ) -> Estimate:
+    def _estimate(self, state: State, n: NormalEquations, solution: health.Solution, frame: Frame6) -> Estimate:
         return Estimate(
             T_world_camera=self.T_world_camera,
             information=health.at_camera(solution.information, frame),

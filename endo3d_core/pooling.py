@@ -5,6 +5,8 @@ Planes are (6, rows, columns) float32: x, y, z, intensity, texture, sigma. NaN i
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,7 +19,7 @@ _GATE_SIGMAS = 4.0
 
 
 @kernel
-def _median(a, b, c, d):  # type: ignore[no-untyped-def]
+def _median(a: Any, b: Any, c: Any, d: Any) -> Any:
     """Of four; a NaN takes a neighbour's value, which leaves the middle of what is valid."""
     a = a if a == a else (b if b == b else d)
     b = b if b == b else (a if a == a else c)
@@ -28,7 +30,7 @@ def _median(a, b, c, d):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _weight(z, sigma, median, slope):  # type: ignore[no-untyped-def]
+def _weight(z: Any, sigma: Any, median: Any, slope: Any) -> Any:
     near = abs(z - median) <= np.float32(_GATE_SIGMAS) * sigma + slope
     return np.float32(1.0) / (sigma * sigma) if near else np.float32(0.0)
 

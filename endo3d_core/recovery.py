@@ -8,6 +8,7 @@ texture together, and only the best are registered in earnest. What does not con
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,9 +57,7 @@ def recover(view: LiveView, world: MergedMap, T_last: Array, linearisation: Line
     few = rows[:: max(len(rows) // SCORED_POINTS, 1)]
     for _ in range(2):
         # The best pose so far levels the surface; the others are then tried at its height and tilt.
-        scores = _scores(
-            world.rows, few, view.live, view.coefficients, rigid.inverse(poses), 2.0 * view.pitch_mm
-        )
+        scores = _scores(world.rows, few, view.live, view.coefficients, rigid.inverse(poses), 2.0 * view.pitch_mm)
         best = poses[np.argmax(scores)]
         levelled = _refine(best, rows[::4], view, world, frame, linearisation, GATES_CELLS[:2])
         poses = poses @ rigid.inverse(best) @ (levelled[0] if levelled else best)
@@ -94,7 +93,8 @@ def nearby(world: MergedMap, T_last: Array, view: LiveView, frame: Frame6) -> ND
     p = world.rows[rows, :3]
     centre = rigid.apply(T_last, frame.centre)
     reach_mm = (2.0 + 2.0 * REACH) * frame.radius_mm
-    return rows[((p - centre.astype(np.float32)) ** 2).sum(axis=1) < reach_mm**2]
+    near: NDArray[np.int32] = rows[((p - centre.astype(np.float32)) ** 2).sum(axis=1) < reach_mm**2]
+    return near
 
 
 def candidates(T_last: Array, frame: Frame6, view: LiveView) -> Array:
@@ -146,7 +146,7 @@ def _refine(
 
 
 @kernel
-def _scores(map_rows, chosen, live, coefficients, poses, gate):  # type: ignore[no-untyped-def]
+def _scores(map_rows: Any, chosen: Any, live: Any, coefficients: Any, poses: Any, gate: Any) -> Any:
     """poses (n, 4, 4) T_camera_world -> (n,): share of points in place, times agreement of their texture."""
     f = np.float32
     rows, columns = live.shape[0], live.shape[1]
@@ -169,7 +169,7 @@ def _scores(map_rows, chosen, live, coefficients, poses, gate):  # type: ignore[
             if not (u > f(0.0) and v > f(0.0) and u < f(columns) and v < f(rows)):
                 continue
             q = live[int(v), int(u)]
-            if not q[2] == q[2]:
+            if np.isnan(q[2]):
                 continue
             seen += 1
             if abs(q[2] - z) < gate:

@@ -11,6 +11,7 @@ rotation scaled by the surface's radius: all six numbers are mm and comparable.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +30,8 @@ FACING = 0.9
 """Least view cosine of a photometric row: on flanks, shading changes with the pose."""
 
 _TILT_STRIDE = 8
+_SHARED = 2.0
+"""Neighbouring cells share pixels of their gradients: so many points of a voxel count as one independent."""
 SETTLED = 16
 """Measured points from which on a map point's texture is compared as a whole: its noise is a quarter of one's."""
 
@@ -100,7 +103,7 @@ class NormalEquations:
         return self.texture_rms > 0.5 * self.texture_residual
 
 
-def visible_surface(live: NDArray[np.float32], stride: int = 4) -> Frame6:
+def visible_surface(live: NDArray[np.float32], stride: int = 8) -> Frame6:
     """Centre and rms radius of the points of live (rows, columns, LIVE)."""
     points = live[::stride, ::stride, :3].reshape(-1, 3)
     points = points[np.isfinite(points[:, 2])].astype(np.float64)
@@ -145,7 +148,7 @@ class Linearisation:
             geometry=geometry,
             geometry_gradient=-surface[:6, 6],
             geometry_noise=_any_normal(tilted) - tilt_variance * geometry,
-            texture=_signal(texture, textured / max(inverse_counts, 1e-30)),
+            texture=_signal(texture, textured / max(_SHARED * inverse_counts, 1e-30)),
             texture_gradient=-texture[:6, 12],
             texture_live=texture[6:12, 6:12],
             visible=visible,
@@ -194,7 +197,7 @@ def _gram(rows: NDArray[np.float32], count: int) -> Array:
         a = rows[i]
         for j in range(i + 1):
             b = rows[j]
-            total = np.float32(0.0)
+            total: Any = np.float32(0.0)
             for k in range(count):
                 total += a[k] * b[k]
             out[i, j] = out[j, i] = total
@@ -202,18 +205,31 @@ def _gram(rows: NDArray[np.float32], count: int) -> Array:
 
 
 @kernel
-def _rows(  # type: ignore[no-untyped-def]
-    map_rows, map_ints, chosen, live, coefficients, T_camera_world, centre, radius, gate, scale, texture_scale,
-    normal_sigma, surface, textured,
-):  # fmt: skip
+def _rows(
+    map_rows: Any, map_ints: Any, chosen: Any, live: Any, coefficients: Any, T_camera_world: Any,
+    centre: Any, radius: Any, gate: Any, scale: Any, texture_scale: Any, normal_sigma: Any,
+    surface: Any, textured: Any,
+) -> Any:  # fmt: skip
     """Fills surface (11, n) and textured (13, n) with weighted rows; returns counts and robust sums of squares."""
     f = np.float32
     T = T_camera_world
     r00, r01, r02, tx = f(T[0, 0]), f(T[0, 1]), f(T[0, 2]), f(T[0, 3])
     r10, r11, r12, ty = f(T[1, 0]), f(T[1, 1]), f(T[1, 2]), f(T[1, 3])
     r20, r21, r22, tz = f(T[2, 0]), f(T[2, 1]), f(T[2, 2]), f(T[2, 3])
-    c0, c1, c2, c3, c4 = coefficients[0, 0], coefficients[0, 1], coefficients[0, 2], coefficients[0, 3], coefficients[0, 4]
-    d0, d1, d2, d3, d4 = coefficients[1, 0], coefficients[1, 1], coefficients[1, 2], coefficients[1, 3], coefficients[1, 4]
+    c0, c1, c2, c3, c4 = (
+        coefficients[0, 0],
+        coefficients[0, 1],
+        coefficients[0, 2],
+        coefficients[0, 3],
+        coefficients[0, 4],
+    )
+    d0, d1, d2, d3, d4 = (
+        coefficients[1, 0],
+        coefficients[1, 1],
+        coefficients[1, 2],
+        coefficients[1, 3],
+        coefficients[1, 4],
+    )
     gx, gy, gz, per_radius = f(centre[0]), f(centre[1]), f(centre[2]), f(1.0 / radius)
     zero, half, one, three = f(0.0), f(0.5), f(1.0), f(3.0)
     per_scale2, gate32 = f(0.25 / (scale * scale)), f(gate)
@@ -221,7 +237,8 @@ def _rows(  # type: ignore[no-untyped-def]
     tilt_scale = f(normal_sigma)
     rows, columns = live.shape[0], live.shape[1]
     visible = used = texture_used = settled = 0
-    squares = weights = texture_squares = texture_weights = of_map = of_both = inverse_counts = 0.0
+    squares = weights = texture_squares = texture_weights = of_map = of_both = 0.0
+    inverse_counts: Any = 0.0
     for i in range(chosen.size):
         m = map_rows[chosen[i]]
         x = r00 * m[0] + r01 * m[1] + r02 * m[2] + tx
@@ -240,7 +257,7 @@ def _rows(  # type: ignore[no-untyped-def]
         if column >= columns or row >= rows:
             continue
         q = live[row, column]
-        if not q[3] == q[3]:
+        if np.isnan(q[3]):
             continue
         visible += 1
         nx = r00 * m[3] + r01 * m[4] + r02 * m[5]
@@ -285,7 +302,7 @@ def _rows(  # type: ignore[no-untyped-def]
         du, dv = abs(du), abs(dv)
         here = (one - du) * q[6] + du * live[row, aside, 6]
         there = (one - du) * live[below, column, 6] + du * live[below, aside, 6]
-        texture = (one - dv) * here + dv * there
+        texture: Any = (one - dv) * here + dv * there
         difference = texture - m[9]
         squared = difference * difference * q[12]
         if not squared < one:

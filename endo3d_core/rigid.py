@@ -26,14 +26,15 @@ def rotation_exp(w: ArrayLike) -> NDArray[np.float64]:
     W = skew(w)
     if angle < _SMALL_RAD:
         return np.eye(3) + W + 0.5 * W @ W
-    return np.eye(3) + np.sin(angle) / angle * W + (1.0 - np.cos(angle)) / angle**2 * W @ W
+    R: NDArray[np.float64] = np.eye(3) + np.sin(angle) / angle * W + (1.0 - np.cos(angle)) / angle**2 * W @ W
+    return R
 
 
 def rotation_log(R: ArrayLike) -> NDArray[np.float64]:
     """(3, 3) rotation -> rotation vector (3,) rad, of length <= pi."""
     x, y, z, w = quaternion(R)
     sine = float(np.sqrt(x * x + y * y + z * z))
-    scale = 2.0 if sine < _SMALL_RAD else 2.0 * np.arctan2(sine, w) / sine
+    scale = 2.0 if sine < _SMALL_RAD else 2.0 * float(np.arctan2(sine, w)) / sine
     return scale * np.array([x, y, z])
 
 
@@ -42,7 +43,9 @@ def _left_jacobian(w: NDArray[np.float64]) -> NDArray[np.float64]:
     W = skew(w)
     if angle < _SMALL_RAD:
         return np.eye(3) + 0.5 * W + W @ W / 6.0
-    return np.eye(3) + (1.0 - np.cos(angle)) / angle**2 * W + (angle - np.sin(angle)) / angle**3 * W @ W
+    cubic: NDArray[np.float64] = (angle - np.sin(angle)) / angle**3 * W @ W
+    quadratic: NDArray[np.float64] = np.eye(3) + (1.0 - np.cos(angle)) / angle**2 * W
+    return quadratic + cubic
 
 
 def exp(twist: ArrayLike) -> NDArray[np.float64]:
@@ -119,10 +122,12 @@ def rotation(q: ArrayLike) -> NDArray[np.float64]:
     q = np.asarray(q, np.float64)
     x, y, z, w = q / np.linalg.norm(q)
     v = skew([x, y, z])
-    return np.eye(3) + 2.0 * w * v + 2.0 * v @ v
+    R: NDArray[np.float64] = np.eye(3) + 2.0 * w * v + 2.0 * v @ v
+    return R
 
 
 def interpolate(T_a: ArrayLike, T_b: ArrayLike, share: float) -> NDArray[np.float64]:
     """The pose at ``share`` of the way from a to b, along the constant twist."""
-    T_a = np.asarray(T_a, np.float64)
-    return T_a @ exp(share * log(inverse(T_a) @ T_b))
+    T_a, T_b = np.asarray(T_a, np.float64), np.asarray(T_b, np.float64)
+    between: NDArray[np.float64] = T_a @ exp(share * log(inverse(T_a) @ T_b))
+    return between

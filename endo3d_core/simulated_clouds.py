@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,7 +31,7 @@ class Profile:
 
     def distance(self, points: Array) -> Array:
         """Signed distance (n,) mm of scene points (n, 3) to the contour, positive outside."""
-        return _profile_distance(np.ascontiguousarray(points, np.float64), self.parts)
+        return np.asarray(_profile_distance(np.ascontiguousarray(points, np.float64), self.parts))
 
 
 @dataclass(frozen=True, slots=True)
@@ -276,13 +277,15 @@ def _rounded(corners: list[tuple[float, float, float]]) -> list[tuple[float, ...
         start, end = (float(np.arctan2(*(p - centre)[::-1])) for p in (a, b))
         turn = (end - start + np.pi) % (2 * np.pi) - np.pi
         parts.append((LINE, x0, h0, float(a[0]), float(a[1]), 0.0))
-        parts.append((ARC, float(centre[0]), float(centre[1]), radius, min(start, start + turn), max(start, start + turn)))
+        parts.append(
+            (ARC, float(centre[0]), float(centre[1]), radius, min(start, start + turn), max(start, start + turn))
+        )
         x0, h0 = float(b[0]), float(b[1])
     return parts
 
 
 @kernel
-def _albedo(texture, x, y):  # type: ignore[no-untyped-def]
+def _albedo(texture: Any, x: Any, y: Any) -> Any:
     u, v = x / TEXEL_MM, y / TEXEL_MM
     i, j = int(np.floor(u)), int(np.floor(v))
     a, b = u - i, v - j
@@ -293,7 +296,7 @@ def _albedo(texture, x, y):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _cast_profile(origin, directions, parts, texture, depth, shade):  # type: ignore[no-untyped-def]
+def _cast_profile(origin: Any, directions: Any, parts: Any, texture: Any, depth: Any, shade: Any) -> Any:
     ox, oh = origin[0], -origin[2]
     for r in range(depth.shape[0]):
         for c in range(depth.shape[1]):
@@ -321,7 +324,9 @@ def _cast_profile(origin, directions, parts, texture, depth, shade):  # type: ig
                         px, ph = fx + s * dx, fh + s * dh
                         angle = np.arctan2(ph, px)
                         low, high = parts[k, 4], parts[k, 5]
-                        inside = low <= angle <= high or low <= angle + 2 * np.pi <= high or low <= angle - 2 * np.pi <= high
+                        inside = (
+                            low <= angle <= high or low <= angle + 2 * np.pi <= high or low <= angle - 2 * np.pi <= high
+                        )
                         if inside and 0.0 < s < best:
                             best, nx, nh, along = s, px / radius, ph / radius, ox + s * dx - (oh + s * dh)
             depth[r, c] = best if best < np.inf else np.nan
@@ -331,7 +336,7 @@ def _cast_profile(origin, directions, parts, texture, depth, shade):  # type: ig
 
 
 @kernel
-def _cast_ball(origin, directions, radius, height, texture, depth, shade):  # type: ignore[no-untyped-def]
+def _cast_ball(origin: Any, directions: Any, radius: Any, height: Any, texture: Any, depth: Any, shade: Any) -> Any:
     fz = origin[2] - (radius - height)
     ff = origin[0] * origin[0] + origin[1] * origin[1] + fz * fz - radius * radius
     for r in range(depth.shape[0]):
@@ -354,7 +359,7 @@ def _cast_ball(origin, directions, radius, height, texture, depth, shade):  # ty
 
 
 @kernel
-def _cast_quartic(origin, directions, coefficients, texture, depth, shade):  # type: ignore[no-untyped-def]
+def _cast_quartic(origin: Any, directions: Any, coefficients: Any, texture: Any, depth: Any, shade: Any) -> Any:
     for r in range(depth.shape[0]):
         for c in range(depth.shape[1]):
             dx, dy, dz = directions[r, c, 0], directions[r, c, 1], directions[r, c, 2]
@@ -383,7 +388,7 @@ def _cast_quartic(origin, directions, coefficients, texture, depth, shade):  # t
 
 
 @kernel
-def _profile_distance(points, parts):  # type: ignore[no-untyped-def]
+def _profile_distance(points: Any, parts: Any) -> Any:
     out = np.empty(points.shape[0])
     for i in range(points.shape[0]):
         x, h = points[i, 0], -points[i, 2]

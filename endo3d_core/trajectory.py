@@ -54,13 +54,15 @@ def align(estimated: ArrayLike, truth: ArrayLike, alignment: Alignment = "rigid"
     if alignment == "none":
         return estimated
     if alignment == "first":
-        return truth[0] @ rigid.inverse(estimated[0]) @ estimated
+        laid: NDArray[np.float64] = truth[0] @ rigid.inverse(estimated[0]) @ estimated
+        return laid
     T_truth_estimated = np.eye(4)
     U, _, Vt = np.linalg.svd(np.einsum("nij,nkj->ik", truth[:, :3, :3], estimated[:, :3, :3]))
     T_truth_estimated[:3, :3] = U @ np.diag([1.0, 1.0, np.linalg.det(U) * np.linalg.det(Vt)]) @ Vt
     moved = estimated[:, :3, 3] @ T_truth_estimated[:3, :3].T
     T_truth_estimated[:3, 3] = (truth[:, :3, 3] - moved).mean(axis=0)
-    return T_truth_estimated @ estimated
+    fitted: NDArray[np.float64] = T_truth_estimated @ estimated
+    return fitted
 
 
 def ate(estimated: ArrayLike, truth: ArrayLike, alignment: Alignment = "rigid") -> TrajectoryError:

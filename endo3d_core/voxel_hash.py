@@ -6,6 +6,8 @@ numbers packed into 48 bits; an empty slot holds -1.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,7 +18,7 @@ KEY_LIMIT = 32767
 
 
 @kernel
-def pack(kx: int, ky: int, kz: int) -> int:
+def pack(kx: Any, ky: Any, kz: Any) -> Any:
     """Three keys within +-32767 -> one."""
     return ((np.int64(kx) + 32768) << 32) | ((np.int64(ky) + 32768) << 16) | (np.int64(kz) + 32768)
 
@@ -27,7 +29,7 @@ def unpack(key: int) -> tuple[int, int, int]:
 
 
 @kernel
-def home(key: int, mask: int) -> int:
+def home(key: int, mask: int) -> Any:
     """Eight voxels in a row along x share a cache line; rows scatter (Fibonacci hashing)."""
     row = ((key >> 35) << 32) | (key & 0xFFFFFFFF)
     scattered = np.uint64(row) * np.uint64(0x9E3779B97F4A7C15)
@@ -35,7 +37,7 @@ def home(key: int, mask: int) -> int:
 
 
 @kernel
-def find(keys: NDArray[np.int64], rows: NDArray[np.int32], key: int) -> int:
+def find(keys: NDArray[np.int64], rows: NDArray[np.int32], key: int) -> Any:
     """The key's row, or -1."""
     mask = keys.size - 1
     slot = home(key, mask)

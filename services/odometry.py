@@ -12,13 +12,15 @@ from endo3d.schemas import topics
 from endo3d.schemas.messages import Cloud, MapDelta, Message, Pose, ProjectorCalibration, Tracking, Transform
 from endo3d.services.runtime.service import Config, Refused, Service
 from endo3d.services.views.colouring import visible
-from endo3d_core import merging, odometry, rigid
+from endo3d_core import backends, merging, odometry, rigid
 
 SHOWN_RELIEF_MM = 3.0
 """Heights that the colours of the published map tell apart, around the first points' median."""
 
 
 class OdometryConfig(Config):
+    backend: backends.Backend = "projective"
+    """How clouds are registered; kiss-icp and small-gicp are baselines made for lidar."""
     merging_distance_um: float = Field(75.0, ge=10.0, le=1000.0)
     """Points nearer than this become one (section 3.3); it limits the lateral resolution."""
     map_limit: int = Field(1_000_000, ge=10_000)
@@ -57,13 +59,9 @@ class Odometry(Service[OdometryConfig]):
             case Cloud():
                 yield from self._track(message)
             case ProjectorCalibration():
-                yield Transform(
-                    message.stamp_ns, "camera", message.frame_id, rigid.inverse(message.T_projector_camera)
-                )
+                yield Transform(message.stamp_ns, "camera", message.frame_id, rigid.inverse(message.T_projector_camera))
 
-    def command(
-        self, verb: str, parameters: Mapping[str, Any], now_ns: int
-    ) -> Iterator[Message | Mapping[str, Any]]:
+    def command(self, verb: str, parameters: Mapping[str, Any], now_ns: int) -> Iterator[Message | Mapping[str, Any]]:
         """``reset`` empties the map, the next cloud is the world; ``snapshot`` publishes the whole map."""
         match verb:
             case "reset":
@@ -84,10 +82,10 @@ class Odometry(Service[OdometryConfig]):
         share = self.odometry.map.count / self.config.map_limit
         if share < 0.9:
             return ""
-        return f"the map is {share:.0%} full ({self.config.map_limit} points): raise map_limit or reset it"
+        return f"the map is {share:.0%} full; it will forget what it saw longest ago: raise map_limit or reset it"
 
-    def _fresh(self) -> odometry.Odometry:
-        return odometry.Odometry(1e-3 * self.config.merging_distance_um, self.config.map_limit)
+    def _fresh(self) -> backends.Tracker:
+        return backends.make(self.config.backend, 1e-3 * self.config.merging_distance_um, self.config.map_limit)
 
     def _track(self, cloud: Cloud) -> Iterator[Message]:
         self._sequence = cloud.sequence
