@@ -258,7 +258,7 @@ def _mapped(path: Path) -> mmap.mmap:
         with path.open("rb") as file:
             return mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
     except OSError as error:
-        raise Unreadable(f"can't read {path}: {error.strerror}") from error
+        raise Unreadable(f"can't read {path}: {error.strerror}; check the path") from error
     except ValueError as error:
         raise Unreadable(f"{path} is empty") from error
 

@@ -8,6 +8,7 @@ import time
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
 
 
 def replay(
-    log: Annotated[Path, typer.Argument(help="The log (.mcap).")],
+    logs: Annotated[list[Path], typer.Argument(metavar="LOG...", help="The log (.mcap), or its parts in order.")],
     out: Annotated[Path | None, typer.Option("--out", help="Write the results into a new log.")] = None,
     stack: Annotated[str | None, typer.Option("--stack", help="Another stack file than the log's own.")] = None,
     overrides: SetOption = None,
@@ -50,39 +51,45 @@ def replay(
     With --rate the log takes the camera's place in the running stack, with every process and viewer.
 
     Examples: endo3d replay scan.mcap --digest; endo3d replay scan.mcap --set decoder.bin_px=2 --out fine.mcap;
-    endo3d replay scan.mcap --rate 1 --loop
+    endo3d replay scan_*.mcap --only decoder; endo3d replay scan.mcap --rate 1 --loop
     """
     from endo3d.schemas import topics
     from endo3d.services.archive.reader import Log
     from endo3d.services.runtime import replay as engine
     from endo3d.services.runtime.errors import UserError
 
-    recorded = Log(log)
+    parts = [Log(path) for path in logs]
+    first, last = parts[0], parts[-1]
     if unknown := set(topic or ()) - topics.BY_NAME.keys():
         raise UserError(f"no topic {', '.join(sorted(unknown))}; there are {', '.join(topics.BY_NAME)}")
     if loop and rate is None:
         raise UserError("--loop repeats a live replay; add --rate 1")
     if rate is not None:
-        with engine.stack_of(recorded, stack, overrides or ()) as described:
-            _live(engine.live_stack(described, log, rate=rate, loop=loop, start_s=from_s, end_s=to_s, out=out))
-    start_ns = recorded.start_ns + round(from_s * 1e9)
-    end_ns = min(recorded.end_ns + 1, recorded.start_ns + round(min(to_s, 1e9) * 1e9))
+        if len(parts) > 1:
+            raise UserError("a player takes one log; play the parts one by one")
+        with engine.stack_of(first, stack, overrides or ()) as described:
+            _live(engine.live_stack(described, first.path, rate=rate, loop=loop, start_s=from_s, end_s=to_s, out=out))
+    start_ns = first.start_ns + round(from_s * 1e9)
+    end_ns = min(last.end_ns + 1, first.start_ns + round(min(to_s, 1e9) * 1e9))
     digests = engine.Digest() if digest else None
     counts: Counter[str] = Counter()
     with (
-        engine.stack_of(recorded, stack, overrides or ()) as described,
+        engine.stack_of(first, stack, overrides or ()) as described,
         engine.pipeline_of(described, only or ()) as pipeline,
-        _recording(out, recorded, described) as into,
+        _recording(out, first, described) as into,
     ):
         started = time.perf_counter()
-        results = engine.replay(
-            recorded,
-            pipeline,
-            inputs=[topics.BY_NAME[name] for name in topic or ()],
-            start_ns=start_ns,
-            end_ns=end_ns,
-            into=into,
-            digest=digests,
+        results = chain.from_iterable(
+            engine.replay(
+                part,
+                pipeline,
+                inputs=[topics.BY_NAME[name] for name in topic or ()],
+                start_ns=start_ns,
+                end_ns=end_ns,
+                into=into,
+                digest=digests,
+            )
+            for part in parts
         )
         for result in _progress(results, start_ns, end_ns):
             counts[topics.of(result.message).name] += 1

@@ -9,11 +9,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from mcap.reader import make_reader
+from typer.testing import CliRunner
 
 from endo3d.services.archive.reader import Log, Unreadable
 from endo3d.services.archive.recover import is_whole, recover
 from endo3d.services.archive.sink import FileSink
 from endo3d.services.archive.writer import OWN_CHUNK_BYTES, Kind, Writer
+from endo3d.services.cli.app import app
+from endo3d.services.runtime.errors import UserError
 
 KIND = Kind("a.Kind", "protobuf", b"definition")
 
@@ -174,3 +177,15 @@ def test_not_a_log(tmp_path: Path) -> None:
     path.write_bytes(bytes(1000))
     with pytest.raises(Unreadable, match="not an MCAP log"):
         recover(path)
+
+
+def test_the_command(whole: Path, tmp_path: Path) -> None:
+    torn = tmp_path / "torn.mcap"
+    torn.write_bytes(whole.read_bytes()[:-100])
+    first = CliRunner().invoke(app, ["recover", str(torn)])
+    assert first.exit_code == 0
+    assert first.stdout.startswith(f"{torn}: 12 messages in 9 chunks, ")
+    again = CliRunner().invoke(app, ["recover", str(torn)])
+    assert again.stdout == f"{torn}: nothing to repair, 12 messages\n"
+    several = CliRunner().invoke(app, ["recover", str(torn), str(torn), "--out", str(tmp_path / "out.mcap")])
+    assert isinstance(several.exception, UserError)

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 from recorded import record, same, scan
-from rendered import STACK, messages, write
+from rendered import RATE_HZ, STACK, messages, write
 from typer.testing import CliRunner
 
 from endo3d.schemas import codec, topics
@@ -30,9 +30,9 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write(tmp_path_factory.mktemp("replay") / "scan.mcap", FRAMES, BIN_PX)
 
 
-def run(log: Path, *arguments: str) -> dict:
+def run(*arguments: str | Path) -> dict:
     """``endo3d replay``, as a user starts it."""
-    result = CliRunner().invoke(app, ["replay", str(log), "--json", "--digest", *arguments])
+    result = CliRunner().invoke(app, ["replay", "--json", "--digest", *map(str, arguments)])
     if result.exception is not None:
         raise result.exception
     report: dict = json.loads(result.stdout)
@@ -95,6 +95,13 @@ def test_a_cropped_and_packed_log_decodes_to_the_same_bits(log: Path, tmp_path: 
     packed = write(tmp_path / "packed.mcap", FRAMES, BIN_PX, crop=True, compact=True, head=head)
     assert packed.stat().st_size < 0.6 * log.stat().st_size
     assert run(packed, "--only", "decoder")["digests"] == run(log, "--only", "decoder")["digests"]
+
+
+def test_the_parts_of_a_split_log_replay_as_one(log: Path, tmp_path: Path) -> None:
+    write(tmp_path / "scan.mcap", FRAMES, BIN_PX, split_s=5.5 / RATE_HZ)
+    parts = sorted(tmp_path.glob("scan_*.mcap"))
+    assert len(parts) == 3
+    assert run(*parts, "--only", "decoder")["digests"] == run(log, "--only", "decoder")["digests"]
 
 
 def test_a_part_of_the_log(log: Path) -> None:
