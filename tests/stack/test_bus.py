@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 from bus_peers import SHAPE, Collector, frame, hold_frames, limited, read_frames, wait_for, write_frames
-from peers import Peer, new_rig
+from peers import Peer, new_rig, segments
 
 from endo3d.schemas import codec, topics
 from endo3d.schemas.messages import Frame, Level, LogLine, MapDelta, Message, Mode
@@ -453,6 +453,20 @@ def test_what_is_published_last_arrives(rig: str) -> None:
         sequences, broken, _ = reader.ask(("until", 2))
         assert sequences == [0, 1, 2]
         assert broken == 0
+
+
+def test_a_pool_that_can_not_be_mapped_is_said(rig: str) -> None:
+    """zenoh drops such frames without a word; the reader must not stand still without one."""
+    with Bus.open(rig, name="reader") as bus, Peer(write_frames, rig) as writer:
+        bus.declare_alive()
+        writer.hear()
+        for path in set(writer.ask("segments?")) - segments():
+            os.unlink(path)
+        bus.subscribe(topics.FRAME, lambda message: None)
+        deadline = time.monotonic() + 20
+        while not bus.note and time.monotonic() < deadline:
+            time.sleep(0.01)
+        assert "frame does not arrive: its shared memory can't be mapped here" in bus.note
 
 
 # ---------------------------------------------------------------- ports
