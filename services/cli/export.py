@@ -10,6 +10,8 @@ import typer
 from endo3d.services.runtime.errors import UserError
 
 if TYPE_CHECKING:
+    from endo3d.schemas.messages import Cloud, Message
+    from endo3d.schemas.topics import Topic
     from endo3d.services.archive.reader import Log
 
 
@@ -27,8 +29,20 @@ def export(
         Path | None, typer.Option("--clouds", metavar="FOLDER", help="Every single cloud of the log.")
     ] = None,
     clouds_as: Annotated[str, typer.Option("--clouds-as", help="ply, pcd, xyz or e57.")] = "ply",
+    cloud: Annotated[
+        Path | None, typer.Option("--cloud", metavar="FILE", help="One cloud: the last, or see --sequence.")
+    ] = None,
     depth: Annotated[
-        Path | None, typer.Option("--depth", metavar="FOLDER", help="Every depth map, and their scales.")
+        Path | None,
+        typer.Option(
+            "--depth", metavar="FOLDER|FILE", help="Every depth map, and their scales; or one as .npy .png .tiff."
+        ),
+    ] = None,
+    phase: Annotated[
+        Path | None, typer.Option("--phase", metavar="FILE", help="Absolute phase of one cloud, rad, as .npy.")
+    ] = None,
+    sequence: Annotated[
+        int | None, typer.Option("--sequence", help="Of the one cloud or depth map; by default the last.")
     ] = None,
     depth_as: Annotated[str, typer.Option("--depth-as", help="png, tiff (16 bit) or npy (mm).")] = "png",
     ros2: Annotated[
@@ -40,21 +54,30 @@ def export(
 ) -> None:
     """Write clouds, surfaces, depth maps, trajectories or a ROS 2 bag from a log.
 
-    Examples: endo3d export scan.mcap map.ply way.tum; endo3d export scan.mcap --depth depth --ros2 bag
+    Examples: endo3d export scan.mcap map.ply way.tum; endo3d export scan.mcap --depth depth --ros2 bag;
+    endo3d export still.mcap --cloud still.ply --depth still.npy --phase phase.npy
     """
     from endo3d.services.archive.reader import Log
 
-    if not any((targets, clouds, depth, ros2)):
+    if not any((targets, clouds, cloud, depth, phase, ros2)):
         raise UserError(
-            "nothing to export: name a file (map.ply, way.tum, ...), or --clouds, --depth, --ros2"
+            "nothing to export: name a file (map.ply, way.tum, ...), or --cloud, --clouds, --depth, --phase, --ros2"
         )
     opened = Log(log)
     for target in targets or ():
         _file(opened, target, method)
     if clouds is not None:
         _clouds(opened, clouds, clouds_as)
-    if depth is not None:
+    if cloud is not None:
+        from endo3d.services.exchange.clouds import write_cloud
+
+        _say(write_cloud(_one_cloud(opened, sequence).points, cloud), "points", cloud)
+    if depth is not None and depth.suffix:
+        _one_depth(opened, depth, sequence)
+    elif depth is not None:
         _depth(opened, depth, depth_as)
+    if phase is not None:
+        _phase(opened, phase, sequence)
     if ros2 is not None:
         _bag(opened, ros2)
 
@@ -105,6 +128,48 @@ def _depth(log: Log, folder: Path, kind: str) -> None:
 
     maps = (message for message in log.messages(topics.DEPTH) if isinstance(message, DepthMap))
     _say(write_depth_maps(maps, folder, kind), "depth maps", folder)
+
+
+def _one_cloud(log: Log, sequence: int | None) -> Cloud:
+    from endo3d.schemas import topics
+    from endo3d.schemas.messages import Cloud
+
+    found = _one(log, topics.CLOUD, sequence)
+    assert isinstance(found, Cloud)
+    return found
+
+
+def _one_depth(log: Log, target: Path, sequence: int | None) -> None:
+    from endo3d.schemas import topics
+    from endo3d.schemas.messages import DepthMap
+    from endo3d.services.exchange.depth import write_depth_map
+
+    found = _one(log, topics.DEPTH, sequence)
+    assert isinstance(found, DepthMap)
+    _say(write_depth_map(found, target), "pixels", target)
+
+
+def _phase(log: Log, target: Path, sequence: int | None) -> None:
+    from endo3d.services.archive.entry import CALIBRATION_FILE
+    from endo3d.services.exchange.phase import write_phase
+    from endo3d_core.calibration import Rig
+
+    calibration = log.attachments.get(CALIBRATION_FILE)
+    if calibration is None:
+        raise UserError(f"{log.path} carries no calibration; without it there is no phase")
+    _say(write_phase(_one_cloud(log, sequence), Rig.from_yaml(calibration.decode()), target), "pixels", target)
+
+
+def _one(log: Log, topic: Topic, sequence: int | None) -> Message:
+    """The message of that number, or the last. Raises ``UserError`` when there is none."""
+    last = None
+    for message in log.messages(topic):
+        if sequence is None or getattr(message, "sequence", None) == sequence:
+            last = message
+    if last is None:
+        which = "" if sequence is None else f" with sequence {sequence}"
+        raise UserError(f"{log.path} holds no {topic.name}{which}; `endo3d replay LOG --out OUT` decodes the frames")
+    return last
 
 
 def _bag(log: Log, folder: Path) -> None:

@@ -30,10 +30,7 @@ def write_depth_maps(maps: Iterable[DepthMap], folder: str | Path, kind: str = "
     index = []
     for depth_map in maps:
         name = f"{depth_map.sequence:08d}.{kind}"
-        if kind == "npy":
-            np.save(target / name, depth_mm(depth_map))
-        elif not cv2.imwrite(str(target / name), depth_map.depth):
-            raise UserError(f"can't write {target / name}")
+        write_depth_map(depth_map, target / name)
         index.append(
             {
                 "file": name,
@@ -47,6 +44,18 @@ def write_depth_maps(maps: Iterable[DepthMap], folder: str | Path, kind: str = "
         )
     (target / INDEX).write_text(json.dumps({"maps": index}, indent=1) + "\n")
     return len(index)
+
+
+def write_depth_map(depth_map: DepthMap, path: Path) -> int:
+    """Write one map as its suffix says; returns the number of valid pixels. Raises ``UserError``."""
+    kind = path.suffix.lower().removeprefix(".")
+    if kind not in FORMATS:
+        raise UserError(f"no depth format {kind!r}; choose {', '.join(FORMATS)}")
+    if kind == "npy":
+        np.save(path, depth_mm(depth_map))
+    elif not cv2.imwrite(str(path), depth_map.depth):
+        raise UserError(f"can't write {path}; check the folder")
+    return int((depth_map.depth > 0).sum())
 
 
 def depth_mm(depth_map: DepthMap) -> NDArray[np.float32]:

@@ -7,6 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import trimesh
 
 from endo3d.schemas import topics
 from endo3d.schemas.messages import Cloud, Frame
@@ -77,6 +78,12 @@ def test_two_frequencies_in_three_steps_decode_to_the_plane(tmp_path: Path, bits
     assert imported.returncode == 0, imported.stderr
     replayed = endo3d("replay", tmp_path / "shots.mcap", "--out", tmp_path / "out.mcap")
     assert replayed.returncode == 0, replayed.stderr
+    files = [tmp_path / name for name in ("cloud.ply", "depth.npy", "phase.npy")]
+    wanted = [
+        part for option, file in zip(("--cloud", "--depth", "--phase"), files, strict=True) for part in (option, file)
+    ]
+    exported = endo3d("export", tmp_path / "out.mcap", *wanted)
+    assert exported.returncode == 0, exported.stderr
     (cloud,) = clouds_of(tmp_path / "out.mcap")
     assert cloud.points.shape == (HEIGHT, WIDTH)
     truth = plane_mm(rig)
@@ -88,6 +95,12 @@ def test_two_frequencies_in_three_steps_decode_to_the_plane(tmp_path: Path, bits
     error_mm = np.linalg.norm(found - truth, axis=-1)[valid & inside]
     # 8 bit: rounding, 0.29 grey of 102 grey modulation. 16 bit: the lookup's cubic over this wide depth range.
     assert np.sqrt(np.mean(error_mm**2)) < (0.02 if bits == 8 else 0.01)
+    assert len(trimesh.load(files[0]).vertices) == valid.sum()
+    depth_mm, phase = np.load(files[1]), np.load(files[2])
+    np.testing.assert_allclose(depth_mm[valid], found[..., 2][valid], atol=0.002)  # 16 bit over 200 mm
+    true_phase = 2 * np.pi * 30 * lit[..., 0] / rig.projector.width
+    rms_rad = np.sqrt(np.mean((phase - true_phase)[valid & inside] ** 2))
+    assert rms_rad < (0.006 if bits == 8 else 0.002)  # 8 bit: 0.29 / 102 * sqrt(2 / 3) and the other frequency
 
 
 def test_both_axes_are_epochs_of_their_own(tmp_path: Path) -> None:
