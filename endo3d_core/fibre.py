@@ -83,7 +83,7 @@ def _averaging(cores: NDArray[np.float64], shape: tuple[int, int], radius_px: fl
 
 def _leak(cores: NDArray[np.float64], spacing_px: float, share: float) -> sparse.csr_matrix:
     """(cores, cores): what each core gets from its nearest neighbours, ``share`` from each."""
-    distance, index = cKDTree(cores).query(cores, NEIGHBOURS + 1)
+    distance, index = (np.asarray(found) for found in cKDTree(cores).query(cores, NEIGHBOURS + 1))
     near = distance[:, 1:] < 1.5 * spacing_px
     rows = np.nonzero(near)[0]
     columns = index[:, 1:][near]
