@@ -85,6 +85,10 @@ class Recorder(Tap[RecorderConfig]):
         self._latched: dict[str, Entry] = {}
         self._lost: Counter[str] = Counter()
         self._transform: Callable[[Entry], Entry] = _as_it_is
+        self._facts: Mapping[str, str] = {}
+        self._circle_share = 0.0
+        """Diameter of the image circle in widths of the image."""
+        self._trouble = ""
         self._crop: Crop | None = None
         self._spool: Spool | None = None
         self._repairing: threading.Thread | None = None
@@ -93,9 +97,13 @@ class Recorder(Tap[RecorderConfig]):
     def open(self) -> None:
         """Repair what a crash left torn in the directory, in the background.
 
-        Raises ``UserError`` when it can't be written to, or a package for packing is missing.
+        Raises ``UserError`` when it can't be written to, a package for packing is missing, or the head's file
+        for cropping.
         """
+        self._facts = host_facts()
         self._transform = _compactor() if self.config.compact else _as_it_is
+        if self.config.crop:
+            self._circle_share = _circle_share(self.config.head)
         directory = self.config.directory
         try:
             directory.mkdir(parents=True, exist_ok=True)
@@ -114,12 +122,20 @@ class Recorder(Tap[RecorderConfig]):
             return
         entry = self._entry(sample, message)
         if self._start_at_next:
-            self._start(self.config.name, sample.received_ns)
+            self._autostart(sample.received_ns)
         if self._spool is not None and self._due(entry, sample.topic):
             self._put(self._spool, entry, sample, message)
         if entry.latched:
             self._latched[entry.channel] = replace(entry, payload=(bytes(sample.payload),))
         yield from ()
+
+    def _autostart(self, now_ns: int) -> None:
+        self._start_at_next = False
+        try:
+            self._start(self.config.name, now_ns)
+        except OSError as error:
+            self._trouble = f"can't record into {self.config.directory}: {error.strerror}; endo3d record start"
+            _log.error("%s", self._trouble)
 
     def command(self, verb: str, parameters: Mapping[str, Any], now_ns: int) -> Iterator[Message | Mapping[str, Any]]:
         match verb:
@@ -130,18 +146,21 @@ class Recorder(Tap[RecorderConfig]):
                 if name != Path(name).name:
                     raise Refused(f"{name!r} is not a plain file name")
                 self._stop()
-                spool = self._start(name, now_ns)
+                try:
+                    spool = self._start(name, now_ns)
+                except OSError as error:
+                    raise Refused(f"can't record into {self.config.directory}: {error.strerror}") from error
                 yield {"recording": str(spool.recording.path)}
             case "stop":
                 if self._spool is None:
                     raise Refused("not recording; start it first")
-                recording, dropped = self._spool.recording, self._spool.dropped
+                spool = self._spool
                 self._stop()
                 yield {
-                    "files": [str(part) for part in recording.parts],
-                    "messages": recording.messages,
-                    "dropped": dropped.total(),
-                    "bytes": recording.size,
+                    "files": [str(part) for part in spool.recording.parts],
+                    "messages": spool.recording.messages,
+                    "dropped": spool.dropped.total(),
+                    "bytes": spool.recording.size,
                 }
             case _:
                 yield from super().command(verb, parameters, now_ns)
@@ -163,7 +182,7 @@ class Recorder(Tap[RecorderConfig]):
         return self._lost.copy() + Counter(_causes(self._spool))
 
     def trouble(self) -> str:
-        return self._spool.trouble if self._spool is not None else ""
+        return self._spool.trouble if self._spool is not None else self._trouble
 
     def close(self) -> None:
         self._stop()
@@ -187,7 +206,8 @@ class Recorder(Tap[RecorderConfig]):
         """Queue a sample: the received bytes, or those of the image circle alone."""
         if isinstance(message, Frame):
             if self.config.crop and self._crop is None:
-                self._crop = self._circle(*message.image.shape)
+                rows, columns = message.image.shape
+                self._crop = Crop.around_circle(self._circle_share * columns, rows, columns)
             if self._crop is not None:
                 if message.image.shape != (self._crop.of_rows, self._crop.of_columns):
                     self._lost["frame:other size than the recording's first"] += 1
@@ -201,15 +221,6 @@ class Recorder(Tap[RecorderConfig]):
                 return
         spool.put(entry, len(sample.payload), partial(_copy, sample.payload), sample.valid)
 
-    def _circle(self, rows: int, columns: int) -> Crop:
-        """What to keep of an image: where the camera fibre is imaged, as the head's file says."""
-        from endo3d_core.calibration import Rig  # its kernels take a second to load
-        from endo3d_core.head import Head
-
-        text = Path(self.config.head).read_text(encoding="utf-8")
-        scale = columns / Rig.from_yaml(text).camera.width
-        return Crop.around_circle(Head.from_yaml(text).camera_circle_px * scale, rows, columns)
-
     def _due(self, entry: Entry, topic: Topic) -> bool:
         """Whether the topic's archive rate has room for this message."""
         period_ns = self._period_ns[topic.name]
@@ -222,13 +233,13 @@ class Recorder(Tap[RecorderConfig]):
         return True
 
     def _start(self, name: str, now_ns: int) -> Spool:
-        self._start_at_next = False
+        self._start_at_next, self._trouble = False, ""
         config = self.config
         started = datetime.fromtimestamp(now_ns * 1e-9, UTC)
         name = name or f"{config.rig}-{started:%Y%m%dT%H%M%SZ}"
         recording = Recording(
             config.directory / f"{name}.mcap",
-            {**host_facts(), "rig": config.rig, "started": started.isoformat()},
+            {**self._facts, "rig": config.rig, "started": started.isoformat()},
             [Attachment(STACK_FILE, "application/toml", config.stack_toml.encode())],
             split_bytes=config.split_mb << 20,
             split_s=config.split_s,
@@ -267,6 +278,18 @@ def _copy(payload: Buffer, memory: memoryview) -> None:
 
 def _as_it_is(entry: Entry) -> Entry:
     return entry
+
+
+def _circle_share(head: str) -> float:
+    """Diameter of the camera fibre's image in widths of the image, as the head's file says."""
+    from endo3d_core.calibration import Rig  # its kernels take a second to load
+    from endo3d_core.head import Head
+
+    try:
+        text = Path(head).read_text(encoding="utf-8")
+        return Head.from_yaml(text).camera_circle_px / Rig.from_yaml(text).camera.width
+    except (OSError, ValueError) as error:
+        raise UserError(f"crop needs the head's file, and {head or 'none'} is no such: {error}") from error
 
 
 def _compactor() -> Callable[[Entry], Entry]:

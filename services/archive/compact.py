@@ -42,7 +42,9 @@ class Packer:
 
     def __init__(self) -> None:
         require()
-        self._folded: NDArray[Any] = np.empty((0, 0), np.uint8)
+        self._folded: NDArray[Any] = np.zeros((1, 1), np.uint8)
+        blank = np.frombuffer(bytes(1), np.uint8).reshape(1, 1)  # read-only, as decoded images are
+        _fold(blank, self._folded)  # compiles now: no frame has to wait for it
 
     def __call__(self, message: memoryview) -> tuple[Buffer, Buffer]:
         """An encoded ``Frame`` whose pixels are its end, as (head, packed pixels)."""

@@ -140,6 +140,24 @@ def test_what_cannot_be_recorded_to(tmp_path: Path) -> None:
     (tmp_path / "file").write_bytes(b"")
     with pytest.raises(UserError, match=r"can't make the directory .*; choose another"):
         recorder(tmp_path / "file" / "logs")
+    with pytest.raises(UserError, match="crop needs the head's file, and none is no such"):
+        recorder(tmp_path, crop=True)
+
+
+def test_a_directory_that_vanished_is_trouble_not_a_failure(tmp_path: Path) -> None:
+    service = recorder(tmp_path / "logs")
+    (tmp_path / "logs").rmdir()
+    (tmp_path / "logs").write_bytes(b"in the way")
+    take(service, [frame(0), frame(1)])
+    assert "can't record into" in service.trouble()
+    with pytest.raises(Refused, match="can't record into"):
+        command(service, "start")
+    (tmp_path / "logs").unlink()
+    command(service, "start", name="after")
+    take(service, [frame(2)])
+    assert service.trouble() == ""
+    service.close()
+    assert Log(tmp_path / "logs" / "after.mcap").count(topics.FRAME) == 1
 
 
 def test_status_of_several_services_go_to_channels_of_their_own(tmp_path: Path) -> None:
