@@ -11,11 +11,11 @@ import typer
 if TYPE_CHECKING:
     from endo3d.services.evaluation.measure import Settings
 
-EXPERIMENTS = ("spheres", "cylinder", "handheld")
+EXPERIMENTS = ("decode", "spheres", "cylinder", "handheld")
 
 
 def evaluate(
-    experiment: Annotated[str, typer.Argument(help="spheres, cylinder, handheld, or all.")],
+    experiment: Annotated[str, typer.Argument(help="decode, spheres, cylinder, handheld, or all.")],
     quick: Annotated[bool, typer.Option("--quick", help="A small version, in seconds; not the paper's.")] = False,
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for reports, plots and the cache.")] = Path(
         "evaluation"
