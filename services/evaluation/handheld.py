@@ -227,6 +227,12 @@ def _report(
     if shares:
         tables.append(_share_table(shares))
     _plot(folder / f"{name}.png", scan)
+    whole = f"Only {seconds:g} s of the paper's {DURATION_S:g} s were run. " if seconds < DURATION_S else ""
+    part = (
+        f"The shares are of {SHARE_FRAMES / RATE_HZ:.0f} s of it, begun anew: from the middle to one end and back."
+        if shares
+        else ""
+    )
     return Report(
         name,
         "Scan by hand (paper: table 5 and fig. 11)",
@@ -234,7 +240,7 @@ def _report(
             f"`{SCENE}` scanned along its profile, motion `{MOTION}` (seeded: drift of about 3 mm/s, tremor of "
             f"50 to 100 um at 8 to 12 Hz), {RATE_HZ:g} Hz, `{PATTERNS}`, head {HEAD}, camera binned to 960x600, "
             f"merging distance {MERGING_UM:g} um, map points with {AT_LEAST} observations or more. "
-            f"The shares are of {SHARE_FRAMES / RATE_HZ:.0f} s of it, begun anew: from the middle to one end and back.",
+            f"{whole}{part}",
         ],
         tables,
         [f"{name}.png"],
