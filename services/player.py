@@ -20,9 +20,6 @@ from endo3d.services.runtime.service import Config, Refused, Source
 
 _NEVER_NS = 1 << 63
 EPOCHS_PER_PASS = 1 << 16
-LINGER_NS = 500_000_000
-"""After the last message: it lies in memory of this process, and readers need a moment to take it."""
-
 
 PLAYED = (topics.CAMERA, topics.PROJECTOR, topics.MODE, topics.FRAME, topics.TRUTH)
 """What a camera and its projector write."""
@@ -82,7 +79,6 @@ class Player(Source[PlayerConfig]):
         self._frame_due_ns: int | None = None
         self._next_frame_ns = 0
         """When the frame after the last is due, if it comes a period later: a loop has no gap and no rush."""
-        self._last_ns = 0
         self._passes = -1
         self._next_sequence = 0
         self._sequence_shift: int | None = None
@@ -107,7 +103,7 @@ class Player(Source[PlayerConfig]):
         if self._waiting is None:
             self._waiting = next(self._records, None)
         if self._waiting is None:
-            self._at_end(timeout_s)
+            self._at_end()
             return
         now_ns = self.now_ns()
         due_ns = self._due_ns(self._waiting, now_ns)
@@ -152,13 +148,11 @@ class Player(Source[PlayerConfig]):
         self._passes += 1
         self._sequence_shift = None
 
-    def _at_end(self, timeout_s: float) -> None:
+    def _at_end(self) -> None:
         if self.config.loop and self._played:
             next_ns = self._next_frame_ns
             self._seek(self.config.start_s)
             self._next_frame_ns = next_ns
-        elif self.now_ns() < self._last_ns + LINGER_NS:
-            self.wait(timeout_s)
         else:
             self.finished = True
 
@@ -177,7 +171,6 @@ class Player(Source[PlayerConfig]):
         """The recorded message as a camera would give it now."""
         message = record.message()
         self._played = True
-        self._last_ns = due_ns
         self._position_s = (record.log_ns - self._log.start_ns) * 1e-9
         if self.config.restamp:
             message = replace(message, stamp_ns=due_ns)
