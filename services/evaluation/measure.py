@@ -14,6 +14,7 @@ from endo3d.services.decoder import Decoder
 from endo3d.services.evaluation import prerender
 from endo3d.services.evaluation.virtual_run import VirtualRun
 from endo3d.services.odometry import Odometry
+from endo3d_core.live_view import LiveView
 
 Points = NDArray[np.float64]
 Measured = tuple[Cloud, Truth]
@@ -106,6 +107,7 @@ class Merging:
     def __init__(self, merging_distance_um: float, *, true_poses: bool = False) -> None:
         config = Odometry.Config.model_validate({"merging_distance_um": merging_distance_um})
         self._service, self._true_poses = Odometry(config), true_poses
+        self._map, self._view = self._service.odometry.map, LiveView()
         self._estimated: list[NDArray[np.float64]] = []
         self._true: list[NDArray[np.float64]] = []
         self._states: dict[str, int] = {}
@@ -115,9 +117,8 @@ class Merging:
         self._true.append(truth.T_scene_camera)
         if self._true_poses:
             T_world_camera = np.linalg.inv(self._true[0]) @ truth.T_scene_camera
-            odometry = self._service.odometry
-            odometry.view.load(cloud.channels)
-            odometry.map.merge(odometry.view.live, T_world_camera, cloud.sequence)
+            self._view.load(cloud.channels)
+            self._map.merge(self._view.live, T_world_camera, cloud.sequence)
             state = "true"
         else:
             pose = next(m for m in self._service.step(cloud) if isinstance(m, Pose))
@@ -127,7 +128,7 @@ class Merging:
 
     def map(self, at_least: int) -> Map:
         """What was merged so far; points with ``at_least`` so many observations."""
-        points = self._service.odometry.map.points(at_least)
+        points = self._map.points(at_least)
         xyz = np.stack([points[axis] for axis in "xyz"], axis=-1).astype(np.float64)
         T_scene_world = self._true[0]
         return Map(
