@@ -64,7 +64,8 @@ def _products(
     zero, one = np.float32(0.0), np.float32(1.0)
     for x in range(base.size):
         phi, s1, s2 = carrier[x] + base[x], first[x], second[x]
-        valid = phi == phi
+        # Samples that are exactly 0 were dark: they say nothing, and at the edge of the field they would pull.
+        valid = (phi == phi) & (s1 * s1 + s2 * s2 > zero)
         phi = phi if valid else zero
         c1, n1 = cos_sin(phi)
         c2, n2 = cos_sin(rho * phi)

@@ -19,7 +19,8 @@ from endo3d_core.virtual_rig.effects import FAST
 from endo3d_core.virtual_rig.renderer import Renderer
 
 HEAD, PATTERNS, FRAMES = "base6_wd20", "interleaved f1=25", 8
-EXPOSURE_US = 5000.0
+EXPOSURE_US = 15000.0
+"""The brightest fringes reach two thirds of the range."""
 PLANE = "plane tilt=10"
 PIXEL_MM = 0.01
 """Of the 1920x1200 camera, at the working distance."""
