@@ -3,10 +3,10 @@
     python -m bench.archive [SECONDS]
 
 Frames are rendered by the virtual rig with all effects: the packing ratio depends on their (simulated) noise.
-"Paced" is 180 Hz for SECONDS (60 unless told) through the recorder's own step, as the bus calls it. Files go to
-the system's directory for temporary files, up to 25 GB at a time. Goals: paced 0 drops, <= 40 % of a core raw,
-<= 60 % compact; >= 2 GB/s into a null sink; reading >= 1 GB/s; the poses of a 10 GB log in < 0.1 s; decoding a
-log >= 5 x real time.
+"Paced" is 180 Hz for SECONDS (60 unless told; cropped: half) through the recorder's own step, as the bus calls
+it. Files go to the system's directory for temporary files, up to 25 GB at a time. Goals: paced 0 drops, <= 40 %
+of a core raw, <= 60 % compact; >= 2 GB/s into a null sink; reading >= 1 GB/s; the poses of a 10 GB log in < 0.1 s;
+decoding a log >= 5 x real time.
 """
 
 from __future__ import annotations
@@ -190,17 +190,17 @@ def _foxglove(path: Path, frames: list[memoryview]) -> int:
 
 
 def paced(scan: Scan, folder: Path, seconds: float) -> None:
-    print(f"paced {RATE_HZ:.0f} Hz for {seconds:.0f} s, with poses: the recorder's step and its thread")
-    for name, compact, crop in (
-        ("raw", False, False),
-        ("compact", True, False),
-        ("cropped", False, True),
-        ("cropped and compact", True, True),
+    print(f"paced {RATE_HZ:.0f} Hz, with poses: the recorder's step and its thread")
+    for name, compact, crop, duration_s in (
+        ("raw", False, False, seconds),
+        ("compact", True, False, seconds),
+        ("cropped", False, True, seconds / 2),
+        ("cropped and compact", True, True, seconds / 2),
     ):
         config = RecorderConfig(directory=folder, name=name, head=str(HEAD), compact=compact, crop=crop)
         recorder = Recorder(config)
         recorder.open()
-        count, deepest = round(seconds * RATE_HZ), 0
+        count, deepest = round(duration_s * RATE_HZ), 0
         with Measured() as measured:
             began_s = time.perf_counter()
             for k in range(count):
@@ -216,7 +216,7 @@ def paced(scan: Scan, folder: Path, seconds: float) -> None:
         held_hz = count / measured.wall_s
         print(
             f"  {name:22s}{share:5.0f} % of a core{mb_s:7.0f} MB/s{held_hz:7.1f} Hz"
-            f"{count - kept:6d} dropped, queue <= {deepest}",
+            f"{count - kept:6d} of {count} dropped, queue <= {deepest}",
             flush=True,
         )
         if name != "raw":
