@@ -1,4 +1,8 @@
-"""Clouds in; the tip's pose, its health and the merged map out, at camera rate."""
+"""Clouds in; the tip's pose, its health and the merged map out, at camera rate.
+
+On a machine that is too slow for that, live, it takes the newest cloud each time: a pose is never late, and the
+prediction spans the true time between stamps. A replay takes every cloud.
+"""
 
 from __future__ import annotations
 
@@ -35,8 +39,11 @@ class Odometry(Service[OdometryConfig]):
     Config = OdometryConfig
     reads = (topics.CLOUD, topics.PROJECTOR)
     optional = (topics.PROJECTOR,)
+    newest = (topics.CLOUD,)
     writes = (topics.POSE, topics.TRANSFORM, topics.MAP)
     commands = ("reset", "snapshot")
+    nice = 5
+    """It may skip clouds; decoder and recorder may not skip frames."""
 
     def __init__(self, config: OdometryConfig) -> None:
         super().__init__(config)
@@ -44,7 +51,9 @@ class Odometry(Service[OdometryConfig]):
         self._revision = 0
         self._relief_mm: tuple[float, float] | None = None
         self._next_map_ns = 0
-        self._sequence = 0
+        self._sequence: int | None = None
+        self._stride = 0
+        self._skipped = 0
         self._states: dict[str, int] = dict.fromkeys(Tracking, 0)
 
     def warm(self) -> None:
@@ -75,8 +84,8 @@ class Odometry(Service[OdometryConfig]):
         yield {"points": len(delta.points), "revision": self._revision}
 
     def values(self) -> Mapping[str, float]:
-        """Map points, and clouds in each tracking state."""
-        return {"map_points": self.odometry.map.count, **self._states}
+        """Map points, clouds that newer ones overtook (or that were never decoded), and clouds in each state."""
+        return {"map_points": self.odometry.map.count, "clouds_skipped": self._skipped, **self._states}
 
     def trouble(self) -> str:
         share = self.odometry.map.count / self.config.map_limit
@@ -88,7 +97,7 @@ class Odometry(Service[OdometryConfig]):
         return backends.make(self.config.backend, 1e-3 * self.config.merging_distance_um, self.config.map_limit)
 
     def _track(self, cloud: Cloud) -> Iterator[Message]:
-        self._sequence = cloud.sequence
+        self._count_skipped(cloud.sequence)
         estimate = self.odometry.track(cloud.channels, cloud.sequence, cloud.stamp_ns)
         self._states[estimate.state] += 1
         yield Pose(
@@ -110,6 +119,14 @@ class Odometry(Service[OdometryConfig]):
             self._next_map_ns = cloud.stamp_ns + round(1e9 / self.config.map_hz)
             yield self._map_delta(self.odometry.map.take_delta(), cloud.stamp_ns, reset=self._revision == 0)
 
+    def _count_skipped(self, sequence: int) -> None:
+        """By gaps in the sequence, in the shortest step between clouds: not every mode has a cloud for every frame."""
+        step = 0 if self._sequence is None else sequence - self._sequence
+        self._sequence = sequence
+        if step > 0:
+            self._stride = min(self._stride or step, step)
+            self._skipped += step // self._stride - 1
+
     def _map_delta(self, delta: merging.Delta, stamp_ns: int, *, reset: bool) -> MapDelta:
         self._revision += 1
         if self._relief_mm is None and len(delta.points):
@@ -117,7 +134,7 @@ class Odometry(Service[OdometryConfig]):
             self._relief_mm = (middle_mm - SHOWN_RELIEF_MM / 2, middle_mm + SHOWN_RELIEF_MM / 2)
         return MapDelta(
             stamp_ns=stamp_ns,
-            sequence=self._sequence,
+            sequence=self._sequence or 0,
             points=visible(delta.points, *(self._relief_mm or (0.0, 1.0))),
             removed=delta.removed,
             revision=self._revision,
