@@ -50,6 +50,8 @@ class Child:
     name: str
     command: Sequence[str]
     is_source: bool = False
+    nice: int = 0
+    """From its first moment on: who yields to the others must not hold up their start either."""
     state: State = State.STOPPED
     restarts: int = 0
     """Since the last settled run."""
@@ -73,7 +75,9 @@ def children_of(stack: Stack, overrides: Sequence[str] = ()) -> list[Child]:
     assert stack.path is not None
     options = ["--stack", str(stack.path), *(part for override in overrides for part in ("--set", override))]
     command = [sys.executable, "-m", "endo3d.services.cli.app", "run"]
-    return [Child(entry.name, [*command, entry.name, *options], entry.is_source) for entry in stack.entries]
+    return [
+        Child(entry.name, [*command, entry.name, *options], entry.is_source, entry.kind.nice) for entry in stack.entries
+    ]
 
 
 class Launcher:
@@ -173,6 +177,7 @@ class Launcher:
             env={**self.environment, "ENDO3D_PARENT_PID": str(os.getpid())},
             start_new_session=True,
         )
+        os.setpriority(os.PRIO_PROCESS, child.process.pid, max(child.nice, os.getpriority(os.PRIO_PROCESS, 0)))
         child.state, child.started_at_s, child.partial = State.RUNNING, time.monotonic(), b""
         child.pidfd = os.pidfd_open(child.process.pid)
         assert child.process.stdout is not None

@@ -39,7 +39,7 @@ def run(service: Service[Any], *, rig: str, name: str, port: int | None = None, 
     """
     logs.to_stderr()
     sys.setswitchinterval(_SWITCH_S)
-    os.nice(service.nice)
+    os.setpriority(os.PRIO_PROCESS, 0, max(service.nice, os.getpriority(os.PRIO_PROCESS, 0)))
     with Bus.open(rig, name=name, port=port, shm_mb=shm_mb) as bus:
         runner = Runner(service, bus)
 
