@@ -20,7 +20,7 @@ from rosbags.highlevel import AnyReader
 def endo3d(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-m", "endo3d.services.cli.app", *map(str, arguments)]
     environment = {name: value for name, value in os.environ.items() if "DISPLAY" not in name}
-    return subprocess.run(command, capture_output=True, text=True, timeout=100, env=environment, check=False)
+    return subprocess.run(command, capture_output=True, text=True, timeout=240, env=environment, check=False)
 
 
 def test_export_writes_everything_that_is_named(log: Path, tmp_path: Path) -> None:
@@ -75,10 +75,10 @@ def test_view_serves_a_page_and_ends_with_all_it_started(log: Path) -> None:
         assert view.stdout is not None
         page = re.search(r"open (\S+)", view.stdout.readline())
         assert page is not None
-        with urllib.request.urlopen(page[1], timeout=20) as reply:
+        with urllib.request.urlopen(page[1], timeout=90) as reply:
             assert b"rerun" in reply.read().lower()
         started = psutil.Process(view.pid).children()
         assert [process.name() for process in started] == ["rerun"]
         view.send_signal(signal.SIGINT)
-        assert view.wait(timeout=20) == 0
+        assert view.wait(timeout=90) == 0
     assert not any(process.is_running() for process in started)

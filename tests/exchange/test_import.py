@@ -58,7 +58,7 @@ def toml(shown: list[patterns.Pattern], head: str = "", *, pitch_of: int = 0) ->
 
 def endo3d(*arguments: object) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-m", "endo3d.services.cli.app", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=110, check=False)
+    return subprocess.run(command, capture_output=True, text=True, timeout=240, check=False)
 
 
 THREE_STEP = list(patterns.parse("sequence f=30/30/30/29/29/29 shifts=-2.0944/0/2.0944/-2.0944/0/2.0944").patterns)

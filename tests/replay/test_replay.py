@@ -156,7 +156,7 @@ def test_the_live_stack_computes_the_same_bits(log: Path, tmp_path: Path) -> Non
     out = tmp_path / "live.mcap"
     rig = f"rig.name=replay{os.getpid()}"
     command = [sys.executable, "-m", "endo3d.services.cli.app", "replay", str(log), "--rate", "0.1"]
-    done = subprocess.run([*command, "--set", rig, "--out", str(out)], capture_output=True, text=True, timeout=100)
+    done = subprocess.run([*command, "--set", rig, "--out", str(out)], capture_output=True, text=True, timeout=240)
     assert done.returncode == 0, done.stderr
     live = Log(out)
     assert live.count(topics.FRAME) == live.count(topics.TRUTH) == FRAMES

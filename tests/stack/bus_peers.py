@@ -49,7 +49,7 @@ def wait_for(bus: Bus, service: str) -> None:
             there.set()
 
     bus.watch_alive(see)
-    assert there.wait(20), f"{service} did not come"
+    assert there.wait(90), f"{service} did not come"
 
 
 class Collector:
@@ -112,7 +112,7 @@ def hold_frames(pipe: Connection, rig: str) -> None:
         bus.declare_alive()
         pipe.send("ready")
         while pipe.recv() != "stop":
-            assert came.wait(20)
+            assert came.wait(90)
             pipe.send((bus.intact(), [is_whole(message) for message in held]))
 
 

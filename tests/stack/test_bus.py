@@ -77,7 +77,7 @@ class First:
         self._came.set()
 
     def wait(self) -> Any:
-        assert self._came.wait(20), "no message came"
+        assert self._came.wait(90), "no message came"
         return self.messages[0]
 
 
@@ -203,7 +203,7 @@ def test_every_service_has_its_own_log_key(bus: Bus, rig: str) -> None:
         wait_for(bus, "recorder")
         for service in ("grabber", "decoder"):
             bus.publish(LogLine(1, Level.INFO, "ready", service))
-            assert came.acquire(timeout=20)
+            assert came.acquire(timeout=90)
     assert sources == ["grabber", "decoder"]
 
 
@@ -225,7 +225,7 @@ def test_a_burst_of_small_messages_arrives_whole(rig: str) -> None:
         wait_for(writer, "reader")
         for line in range(burst):
             writer.publish(LogLine(1, Level.INFO, "x" * 200, "writer", line=line))
-        assert last.wait(20)
+        assert last.wait(90)
     assert lines == list(range(burst))
 
 
@@ -277,7 +277,7 @@ def test_a_killed_reader_does_not_leak_the_pool(rig: str) -> None:
                     bus.publish(frame(bus, sequence))
                 assert holder.ask("held?")[0]
                 holder.kill()
-        deadline = time.monotonic() + 5
+        deadline = time.monotonic() + 90
         loans: list[Any] = []
         while len(loans) < SLOTS - 1 and time.monotonic() < deadline:
             try:
@@ -297,7 +297,7 @@ def test_a_stopped_reader_knows_that_its_frames_are_void(rig: str) -> None:
             bus.publish(frame(bus, sequence))
         assert holder.ask("held?") == (True, [True] * 3)
         holder.signal(signal.SIGSTOP)
-        deadline = time.monotonic() + 10
+        deadline = time.monotonic() + 90
         while bus.tally.published["frame"] < 3 + 2 * SLOTS and time.monotonic() < deadline:
             with suppress(Exhausted):  # until the link is cut
                 bus.publish(frame(bus, 100))
@@ -325,9 +325,9 @@ def test_a_reader_that_was_cut_off_comes_back(rig: str) -> None:
 
         bus.watch_alive(see)
         reader.signal(signal.SIGSTOP)
-        assert gone.wait(10)
+        assert gone.wait(90)
         reader.signal(signal.SIGCONT)
-        assert back.wait(10)
+        assert back.wait(90)
         bus.publish(frame(bus, 1))
         sequences, broken, _ = reader.ask(("until", 1))
         assert sequences == [0, 1]
@@ -463,7 +463,7 @@ def test_a_pool_that_can_not_be_mapped_is_said(rig: str) -> None:
         for path in set(writer.ask("segments?")) - segments():
             os.unlink(path)
         bus.subscribe(topics.FRAME, lambda message: None)
-        deadline = time.monotonic() + 20
+        deadline = time.monotonic() + 90
         while not bus.note and time.monotonic() < deadline:
             time.sleep(0.01)
         assert "frame does not arrive: its shared memory can't be mapped here" in bus.note
@@ -552,8 +552,8 @@ def test_who_is_there(bus: Bus, rig: str) -> None:
     bus.watch_alive(see)
     with Bus.open(rig, name="decoder") as other:
         other.declare_alive()
-        assert change.acquire(timeout=20)
+        assert change.acquire(timeout=90)
         assert bus.alive() == {"decoder"}
-    assert change.acquire(timeout=20)
+    assert change.acquire(timeout=90)
     assert bus.alive() == set()
     assert seen == [("decoder", True), ("decoder", False)]

@@ -42,7 +42,7 @@ class Ros:
         """So many samples, by key."""
         taken = defaultdict(list)
         for _ in range(count):
-            sample = self.samples.get(timeout=20)
+            sample = self.samples.get(timeout=90)
             taken[str(sample.key_expr)].append(sample)
         return taken
 
@@ -106,14 +106,14 @@ def test_a_listener_gets_what_rosbags_would_have_sent(ros: Ros, bridge: Ros2Brid
 def test_the_graph_sees_node_and_publishers_come_and_go(ros: Ros, bridge: Ros2Bridge) -> None:
     for message in messages(1):
         list(bridge.step(message))
-    came = [ros.tokens.get(timeout=20) for _ in range(8)]
+    came = [ros.tokens.get(timeout=90) for _ in range(8)]
     assert all(sample.kind == zenoh.SampleKind.PUT for sample in came)
     keys = sorted(str(sample.key_expr).split("/")[5:9] for sample in came)
     assert keys == sorted([["NN", "%", "%", "endo3d"], *[["MP", "%", "%", "endo3d"]] * 7])
     entities = {str(sample.key_expr).split("/")[4] for sample in came}
     assert len(entities) == 8
     bridge.close()
-    gone = [ros.tokens.get(timeout=20) for _ in range(8)]
+    gone = [ros.tokens.get(timeout=90) for _ in range(8)]
     assert all(sample.kind == zenoh.SampleKind.DELETE for sample in gone)
 
 
@@ -143,7 +143,7 @@ def test_a_restarted_router_is_found_again(ros: Ros, bridge: Ros2Bridge) -> None
             break
     else:
         pytest.fail("nothing came any more")
-    assert again.tokens.get(timeout=20).kind == zenoh.SampleKind.PUT
+    assert again.tokens.get(timeout=90).kind == zenoh.SampleKind.PUT
     again.session.close()
 
 

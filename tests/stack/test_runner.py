@@ -131,7 +131,7 @@ def test_alive_only_when_warm(outside: Bus, rig: str) -> None:
 
     class Slow(Halver):
         def warm(self) -> None:
-            assert release.wait(20)
+            assert release.wait(90)
 
     statuses = watch(outside, topics.STATUS)
     with running(Slow(Config()), rig, "slow"):
@@ -149,7 +149,7 @@ def test_a_tap_gets_what_travels_undecoded(outside: Bus, rig: str) -> None:
         sent = frame(outside, 4, loaned=False)
         outside.publish(sent)
         outside.publish(LogLine(1, Level.INFO, "hello", "grabber"))
-        deadline = time.monotonic() + 20
+        deadline = time.monotonic() + 90
         while len(keeper.kept) < 2 and time.monotonic() < deadline:
             time.sleep(0.01)
     kept = {(topic, source): (payload, valid) for topic, source, payload, valid in keeper.kept}
@@ -224,7 +224,7 @@ def test_turns_are_taken_in_order_of_arrival() -> None:
         for number in range(5):
             threads.append(threading.Thread(target=want, args=(number,)))
             threads[-1].start()
-            assert arrived.acquire(timeout=20)
+            assert arrived.acquire(timeout=90)
             while len(turn._waiting) <= number:
                 time.sleep(0.001)
     for thread in threads:
@@ -312,7 +312,7 @@ def test_results_from_void_memory_are_not_published(outside: Bus, rig: str, monk
         depths.wait(lambda depth: depth.sequence == 0)
         monkeypatch.setattr(bus, "intact", lambda: False)
         outside.publish(frame(outside, 1, (24, 32)))
-        deadline = time.monotonic() + 20
+        deadline = time.monotonic() + 90
         while not bus.tally.dropped and time.monotonic() < deadline:
             time.sleep(0.005)
         assert bus.tally.dropped == {"frame:invalidated": 1}
@@ -340,7 +340,7 @@ def test_a_signal_ends_the_process_cleanly(outside: Bus, rig: str, number: int) 
     try:
         frames.wait(lambda message: isinstance(message, Frame) and message.sequence > 3)
         process.send_signal(number)
-        _, errors = process.communicate(timeout=20)
+        _, errors = process.communicate(timeout=90)
     finally:
         process.kill()
     assert process.returncode == 0

@@ -49,7 +49,7 @@ def rig_at_work() -> Iterator[str]:
 
 def test_tap_yields_messages() -> None:
     with rig_at_work() as rig:
-        clouds = tap("cloud", rig=rig, timeout_s=20)
+        clouds = tap("cloud", rig=rig, timeout_s=90)
         first, second = next(clouds), next(clouds)
         clouds.close()  # type: ignore[attr-defined]
     assert isinstance(first, Cloud)
@@ -60,7 +60,7 @@ def test_tap_yields_messages() -> None:
 
 def test_a_slow_loop_gets_the_newest() -> None:
     with rig_at_work() as rig:
-        frames = tap(topics.FRAME, rig=rig, timeout_s=20)
+        frames = tap(topics.FRAME, rig=rig, timeout_s=90)
         first = next(frames)
         time.sleep(0.5)
         second = next(frames)

@@ -143,7 +143,7 @@ def test_a_stalled_viewer_holds_nobody_up_and_is_told(rerun_server: ViewerProces
     assert "doesn't take what it gets" in viewer.trouble()
     assert viewer.losses()["view:not taken"] > 10
     os.kill(rerun_server.pid, signal.SIGCONT)
-    deadline = time.monotonic() + 20
+    deadline = time.monotonic() + 90
     start_s = 10.0
     while viewer.trouble() and time.monotonic() < deadline:
         feed(viewer, 0.5, start_s)
@@ -178,7 +178,7 @@ viewer.close()
 def test_the_process_ends_beside_a_stalled_viewer(rerun_server: ViewerProcess) -> None:
     command = [sys.executable, "-c", ENDS_BESIDE_A_STALLED_VIEWER, rerun_server.url, str(rerun_server.pid)]
     environment = {**os.environ, "PYTHONPATH": str(Path(scans.__file__).parent)}
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=40, check=False)
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120, check=False)
     assert done.returncode == 0, done.stderr
 
 
@@ -189,7 +189,7 @@ def test_a_killed_viewer_is_survived_and_its_page_comes_back() -> None:
     feed(viewer, 0.5, 0.0)
     first = viewer.process.pid
     os.kill(first, signal.SIGKILL)
-    deadline = time.monotonic() + 20
+    deadline = time.monotonic() + 90
     start_s = 1.0
     while (viewer.process.pid == first or viewer.trouble()) and time.monotonic() < deadline:
         assert feed(viewer, 0.5, start_s) < 20.0
