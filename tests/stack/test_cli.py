@@ -18,7 +18,7 @@ from endo3d.services.runtime import stack_file
 from endo3d.services.runtime.errors import UserError
 from endo3d.services.runtime.session import meeting_ports
 
-LIMIT_S = 60
+LIMIT_S = 180
 COMMANDS = list(LazyGroup().commands)
 READ_LOGS = [name for name in ("replay", "view", "export") if name in COMMANDS]
 

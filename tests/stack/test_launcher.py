@@ -31,7 +31,7 @@ STUBBORN = (
     PRELUDE + "signal.signal(signal.SIGTERM, signal.SIG_IGN)\nsay('ready')\nwhile True: signal.pause()\n"
 )
 
-LIMIT_S = 20.0
+LIMIT_S = 90.0
 
 
 def child(name: str, body: str, *, is_source: bool = False) -> Child:
