@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from endo3d_core import health, rigid
 from endo3d_core.live_view import POOL, LiveView
 from endo3d_core.merging import MergedMap
-from endo3d_core.recovery import believable, convincing, recover
+from endo3d_core.recovery import Search, believable, convincing
 from endo3d_core.registration import Frame6, Linearisation, NormalEquations, Scales, visible_surface
 
 Array = NDArray[np.float64]
@@ -79,6 +79,7 @@ class Odometry:
         self._tilt_rad = 0.0
         self.submap = 0
         self._failures = 0
+        self._search: Search | None = None
         self._merged = 0
         self._visible = self.map.touched
 
@@ -112,7 +113,7 @@ class Odometry:
         """The first cloud of a map defines where it is: nothing is uncertain yet."""
         self._last_ns = stamp_ns
         self._velocity[:] = 0.0
-        self._period_ns, self._failures, self._merged = 0, 0, 0
+        self._period_ns, self._failures, self._merged, self._search = 0, 0, 0, None
         self._scale_mm = 2.0 * self.view.sigma_mm
         self._texture_scale, self._tilt_rad = 0.1, 0.0
         return Estimate(
@@ -126,23 +127,31 @@ class Odometry:
         return gap_ns <= 0 or gap_ns > _LONGEST_GAP * self._period_ns > 0
 
     def _predict(self, stamp_ns: int) -> Array:
+        return self.T_world_camera if self._is_stale(stamp_ns) else self._extrapolated(stamp_ns)
+
+    def _extrapolated(self, stamp_ns: int) -> Array:
+        """At the velocity of the last pose, over the time since it."""
         assert self._last_ns is not None
-        if self._is_stale(stamp_ns):
-            return self.T_world_camera
         return self.T_world_camera @ rigid.exp(self._velocity * (stamp_ns - self._last_ns))
 
     def _recover(self, stamp_ns: int) -> Estimate:
-        """Wide search against the map; a new one when that keeps failing, or at once if there is hardly one yet."""
-        self._failures += 1
-        found = recover(self.view, self.map, self.T_world_camera, self._equations)
-        if found is not None:
-            self._visible = found.visible
-            self._scale_mm, self._texture_scale = found.equations.residual_mm, found.equations.texture_residual
-            estimate = self._register(found.T_world_camera, stamp_ns)
+        """A part of the search; a new map when that keeps failing, or at once if there is hardly one yet."""
+        starts = [self.T_world_camera]
+        if self._search is None:
+            self._search = Search(self.map, self.T_world_camera, self.view)
+            starts = [self._extrapolated(stamp_ns), self.T_world_camera]
+        stale = self._is_stale(stamp_ns)
+        T = self._search.look(self.view, starts, self._equations)
+        if T is not None:
+            self._visible = self._search.rows
+            self._scale_mm, self._texture_scale = self.view.sigma_mm, 0.1
+            estimate = self._register(T, stamp_ns)
             if estimate is not None:
-                self._failures = 0
-                self._velocity[:] = 0.0
+                self._failures, self._search = 0, None
+                if stale:  # the mean over a long gap says nothing about now
+                    self._velocity[:] = 0.0
                 return replace(estimate, state=State.RELOCALISED)
+        self._failures += 1
         if self._merged < _HARDLY_A_MAP or self._failures > _PATIENCE:
             self.submap += self._merged >= _HARDLY_A_MAP
             self.map.clear()

@@ -1,13 +1,15 @@
-"""Finding the lost camera again: a wide search against the whole map, then a verified registration.
+"""Finding the lost camera again: a wide search against the map, a bounded part of it per cloud, then verification.
 
 After an occlusion the tip has moved by millimetres; registration alone would slide into the nearest
-position that looks alike. So poses around the last one are scored on a few map points, geometry and
-texture together, and only the best are registered in earnest. What does not convince is refused.
+position that looks alike. So first the predicted and the last pose are tried with gates that narrow in steps, which
+bridges a gap of missed clouds. Then poses further and further around the last one are scored on a few map points,
+geometry and texture together, so many per cloud that a search never holds up the clouds that follow, and only the
+best is registered in earnest. What does not convince is refused.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -16,7 +18,7 @@ from numpy.typing import NDArray
 from endo3d_core import health, rigid
 from endo3d_core.compiled import kernel
 from endo3d_core.live_view import LiveView
-from endo3d_core.merging import MergedMap
+from endo3d_core.merging import CONFIRMED, COUNT, MergedMap
 from endo3d_core.registration import Frame6, Linearisation, NormalEquations, Scales, visible_surface
 
 Array = NDArray[np.float64]
@@ -25,51 +27,71 @@ REACH = 0.35
 """How far the search goes to each side, in widths of the visible surface."""
 STEP_CELLS = 2.5
 """Spacing of the tried positions in pooled cells: finer than the texture the head resolves."""
-SCORED_POINTS = 1200
-CANDIDATES = 6
+SCORED_POINTS = 800
+SCORED_POSES = 200
+"""Tried with one cloud."""
+REGISTERED_POINTS = 3200
+"""Map points that a pose is registered and verified with."""
 GATES_CELLS = (6.0, 3.0, 1.5, 1.0)
 """Gates of the registration from a candidate, widest first, in pooled cells."""
+_STEPS_PER_GATE = 2
 CONVINCING_SHARE, BELIEVABLE_SHARE = 0.6, 0.35
 """Of the visible map points that must agree: for a pose found by searching, and for a predicted one."""
 CONVINCING_TEXTURE, BELIEVABLE_TEXTURE = 0.75, 0.6
 """Where there is texture: least slope of the cloud's over the map's; 1 is the same, a wrong place gives 0."""
 
 
-@dataclass(frozen=True, slots=True)
-class Recovered:
-    """A pose that convinced."""
+class Search:
+    """One loss: where was looked already, and the map points to compare with (a lost camera adds none)."""
 
-    T_world_camera: Array
-    equations: NormalEquations
-    solution: health.Solution
-    frame: Frame6
-    visible: NDArray[np.int32]
-    """Map rows to register the next cloud against."""
+    def __init__(self, world: MergedMap, T_last: Array, view: LiveView) -> None:
+        frame = visible_surface(view.live)
+        self._world = world
+        self._T_last = T_last
+        self._shifts = shifts(frame, view)
+        self._levelling = np.eye(4)
+        self._next = 0
+        self.rows = nearby(world, T_last, frame)
 
-
-def recover(view: LiveView, world: MergedMap, T_last: Array, linearisation: Linearisation) -> Recovered | None:
-    """The pose of ``view`` in ``world``, searched around ``T_last``; None when nothing convinces."""
-    frame = visible_surface(view.live)
-    rows = nearby(world, T_last, view, frame)
-    if len(rows) < 100:
-        return None
-    poses = candidates(T_last, frame, view)
-    few = rows[:: max(len(rows) // SCORED_POINTS, 1)]
-    for _ in range(2):
-        # The best pose so far levels the surface; the others are then tried at its height and tilt.
-        scores = _scores(world.rows, few, view.live, view.coefficients, rigid.inverse(poses), 2.0 * view.pitch_mm)
+    def look(self, view: LiveView, starts: Iterable[Array], linearisation: Linearisation) -> Array | None:
+        """The pose of ``view``: one of ``starts``, or one of the next ``SCORED_POSES``; None if none convinces."""
+        if len(self.rows) < 100:
+            return None
+        frame = visible_surface(view.live)
+        for start in starts:
+            refined = self._refine(start, view, frame, linearisation)
+            if refined is not None and convincing(refined[1]):
+                return refined[0]
+        tried = self._shifts[self._next : self._next + SCORED_POSES]
+        self._next = self._next + SCORED_POSES if self._next + SCORED_POSES < len(self._shifts) else 0
+        poses = self._T_last @ tried @ self._levelling
+        few = self.rows[:: max(len(self.rows) // SCORED_POINTS, 1)]
+        scores = _scores(self._world.rows, few, view.live, view.coefficients, rigid.inverse(poses), 2.0 * view.pitch_mm)
         best = poses[np.argmax(scores)]
-        levelled = _refine(best, rows[::4], view, world, frame, linearisation, GATES_CELLS[:2])
-        poses = poses @ rigid.inverse(best) @ (levelled[0] if levelled else best)
-    found = []
-    for k in _peaks(poses, scores, 2.0 * STEP_CELLS * view.pitch_mm):
-        refined = _refine(poses[k], rows, view, world, frame, linearisation, GATES_CELLS)
-        if refined is not None and convincing(refined[1]):
-            found.append(refined)
-    if not found:
-        return None
-    T, n, solution = max(found, key=lambda f: f[1].used / (f[1].residual_mm * f[1].texture_residual))
-    return Recovered(T, n, solution, frame, rows)
+        refined = self._refine(best, view, frame, linearisation)
+        if refined is None:
+            return None
+        # What levels the best pose levels the next ones too: height and tilt change slowly.
+        self._levelling = self._levelling @ rigid.inverse(best) @ refined[0]
+        return refined[0] if convincing(refined[1]) else None
+
+    def _refine(
+        self, T: Array, view: LiveView, frame: Frame6, linearisation: Linearisation
+    ) -> tuple[Array, NormalEquations] | None:
+        """Registration with gates that narrow; None when too few points are in place."""
+        texture_scale = 0.2
+        result = None
+        for gate in GATES_CELLS:
+            gate_mm = gate * view.pitch_mm
+            for _ in range(_STEPS_PER_GATE):
+                scales = Scales(gate_mm, gate_mm / 4.0, texture_scale, view.normal_rad)
+                n = linearisation.at(T, self._world, self.rows, view.live, view.coefficients, frame, scales)
+                if n.used < 30:
+                    return None
+                T = T @ health.motion(health.solve(n, max(view.sigma_mm, n.residual_mm)).step, frame)
+                texture_scale = max(n.texture_residual, 1e-3)
+                result = T, n
+        return result
 
 
 def convincing(n: NormalEquations) -> bool:
@@ -87,62 +109,36 @@ def _agrees(n: NormalEquations, least_share: float, least_slope: float) -> bool:
     return in_place and not (n.textured_scene and n.texture_slope < least_slope)
 
 
-def nearby(world: MergedMap, T_last: Array, view: LiveView, frame: Frame6) -> NDArray[np.int32]:
-    """Rows of confirmed map points that the search could bring into view."""
-    rows = world.confirmed()
-    p = world.rows[rows, :3]
+def nearby(world: MergedMap, T_last: Array, frame: Frame6) -> NDArray[np.int32]:
+    """At most ``REGISTERED_POINTS`` rows, evenly, of confirmed map points that the search could bring into view."""
     centre = rigid.apply(T_last, frame.centre)
-    reach_mm = (2.0 + 2.0 * REACH) * frame.radius_mm
-    near: NDArray[np.int32] = rows[((p - centre.astype(np.float32)) ** 2).sum(axis=1) < reach_mm**2]
-    return near
+    near = np.empty(world.used, np.int32)
+    count = _near(world.rows, world.ints, world.used, centre, (2.0 + 2.0 * REACH) * frame.radius_mm, near)
+    return near[:count][:: max(-(-count // REGISTERED_POINTS), 1)].copy()
 
 
-def candidates(T_last: Array, frame: Frame6, view: LiveView) -> Array:
-    """(n, 4, 4) poses shifted across the view, nearest first."""
+@kernel
+def _near(rows: Any, ints: Any, used: Any, centre: Any, reach: Any, near: Any) -> Any:
+    x, y, z, reach2 = np.float32(centre[0]), np.float32(centre[1]), np.float32(centre[2]), np.float32(reach * reach)
+    count = 0
+    for row in range(used):
+        dx, dy, dz = rows[row, 0] - x, rows[row, 1] - y, rows[row, 2] - z
+        if ints[row, COUNT] >= CONFIRMED and dx * dx + dy * dy + dz * dz < reach2:
+            near[count] = row
+            count += 1
+    return count
+
+
+def shifts(frame: Frame6, view: LiveView) -> Array:
+    """(n, 4, 4) translations across the view, nearest first."""
     reach_mm = 2.0 * REACH * frame.radius_mm
     side = np.arange(0.0, reach_mm, STEP_CELLS * view.pitch_mm)
     side = np.concatenate([-side[:0:-1], side])
     dx, dy = (d.ravel() for d in np.meshgrid(side, side))
     order = np.argsort(dx**2 + dy**2, kind="stable")
-    shifts = np.tile(np.eye(4), (len(order), 1, 1))
-    shifts[:, 0, 3], shifts[:, 1, 3] = dx[order], dy[order]
-    return T_last @ shifts
-
-
-def _peaks(poses: Array, scores: Array, apart_mm: float) -> list[int]:
-    """Indices of the best scores that lie apart from better ones."""
-    chosen: list[int] = []
-    for k in np.argsort(-scores, kind="stable"):
-        if all(np.linalg.norm(poses[k, :3, 3] - poses[c, :3, 3]) > apart_mm for c in chosen):
-            chosen.append(int(k))
-        if len(chosen) == CANDIDATES:
-            break
-    return chosen
-
-
-def _refine(
-    T: Array,
-    rows: NDArray[np.int32],
-    view: LiveView,
-    world: MergedMap,
-    frame: Frame6,
-    linearisation: Linearisation,
-    gates_cells: tuple[float, ...],
-) -> tuple[Array, NormalEquations, health.Solution] | None:
-    texture_scale = 0.2
-    result = None
-    for gate in gates_cells:
-        gate_mm = gate * view.pitch_mm
-        for _ in range(3):
-            scales = Scales(gate_mm, gate_mm / 4.0, texture_scale, view.normal_rad)
-            n = linearisation.at(T, world, rows, view.live, view.coefficients, frame, scales)
-            if n.used < 30:
-                return None
-            solution = health.solve(n, max(view.sigma_mm, n.residual_mm))
-            T = T @ health.motion(solution.step, frame)
-            texture_scale = max(n.texture_residual, 1e-3)
-            result = T, n, solution
-    return result
+    out: Array = np.tile(np.eye(4), (len(order), 1, 1))
+    out[:, 0, 3], out[:, 1, 3] = dx[order], dy[order]
+    return out
 
 
 @kernel

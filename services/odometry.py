@@ -57,10 +57,13 @@ class Odometry(Service[OdometryConfig]):
         self._states: dict[str, int] = dict.fromkeys(Tracking, 0)
 
     def warm(self) -> None:
-        """Compile every kernel on a textured plane, in an odometry of its own."""
+        """Compile every kernel on a textured plane, in an odometry of its own: twice as far, it is searched for."""
         trial = odometry.Odometry(capacity=100_000)
-        for sequence in range(3):
-            trial.track(_textured_plane(), sequence, sequence)
+        plane = _textured_plane()
+        for sequence in range(merging.CONFIRMED + 1):
+            trial.track(plane, sequence, sequence)
+        plane[..., :3] *= 2.0
+        trial.track(plane, sequence + 1, sequence + 1)
         trial.map.take_delta()
 
     def step(self, message: Message) -> Iterator[Message]:
@@ -145,10 +148,10 @@ class Odometry(Service[OdometryConfig]):
 
 
 def _textured_plane() -> np.ndarray[Any, np.dtype[np.float32]]:
-    """(48, 64, 6) float32: enough of a cloud to run every step on."""
-    v, u = np.mgrid[:48, :64].astype(np.float32)
-    channels = np.empty((48, 64, 6), np.float32)
-    channels[..., 0], channels[..., 1], channels[..., 2] = (u - 32) / 3, (v - 24) / 3, 20.0
+    """(96, 128, 6) float32: enough of a cloud to run every step on."""
+    v, u = np.mgrid[:96, :128].astype(np.float32)
+    channels = np.empty((96, 128, 6), np.float32)
+    channels[..., 0], channels[..., 1], channels[..., 2] = (u - 64) / 6, (v - 48) / 6, 20.0
     channels[..., 3] = 100.0 + 20.0 * np.sin(0.9 * u) * np.cos(0.7 * v)
     channels[..., 4], channels[..., 5] = 1.0, 0.01
     return channels

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
+from endo3d_core import recovery, trajectory
 from endo3d_core import simulated_clouds as sim
-from endo3d_core import trajectory
+from endo3d_core.merging import MergedMap
 from endo3d_core.odometry import Estimate, Odometry, State
+from endo3d_core.registration import Linearisation
 
 SMALL = sim.Sensor(width=240, height=160)
 """A coarser grid over the same field: a third of the work."""
@@ -45,3 +49,53 @@ def test_without_texture_the_extrusion_is_held_and_reported() -> None:
     error_um = 1e3 * (poses[:, :3, 3] - moved[:, :3, 3])
     assert np.abs(error_um[:, [0, 2]]).max() < 20.0
     assert np.ptp(poses[:, 1, 3]) < 0.3, "the held direction must not run away"
+
+
+def jump(scene: str, by_mm: tuple[float, float, float], clouds: int) -> tuple[Odometry, list[Estimate], float]:
+    """A hand-guided scan, 0.3 s of nothing, then a still camera elsewhere: odometry, what it said there, error um."""
+    odometry, sensor = Odometry(), SMALL
+    _, poses, truth = scan(odometry, scene, 0.2)
+    there = truth[-1].copy()
+    there[:3, 3] += by_mm
+    caster, after_ns = sim.Caster(sim.SCENES[scene](), sensor), round(0.5e9)
+    estimates = [
+        odometry.track(caster.cast(there, 1000 + k), 1000 + k, after_ns + k * 5_800_000) for k in range(clouds)
+    ]
+    expected = poses[-1] @ np.linalg.inv(truth[-1]) @ there
+    return odometry, estimates, float(1e3 * np.linalg.norm(estimates[-1].T_world_camera[:3, 3] - expected[:3, 3]))
+
+
+@pytest.mark.parametrize("scene", ["contour", "ball"])
+def test_a_camera_that_jumped_is_found_within_a_few_clouds(scene: str) -> None:
+    odometry, estimates, error_um = jump(scene, (0.9, -0.7, 0.15), clouds=10)
+    assert estimates[-1].state == State.TRACKING
+    assert {e.state for e in estimates} <= {State.LOST, State.RELOCALISED, State.TRACKING}
+    assert error_um < 20.0
+    assert odometry.submap == 0
+
+
+def test_a_camera_that_stays_lost_begins_a_new_submap() -> None:
+    odometry, estimates, _ = jump("blade", (9.0, 0.0, 0.0), clouds=32)
+    assert {e.state for e in estimates[:25]} == {State.LOST}
+    assert not any(e.information.any() for e in estimates[:25])
+    assert odometry.submap == 1
+    assert estimates[-1].state == State.TRACKING
+
+
+def test_a_search_does_a_bounded_share_of_its_work_per_cloud(monkeypatch: pytest.MonkeyPatch) -> None:
+    rows: list[int] = []
+    at = Linearisation.at
+
+    def counting(self: Linearisation, T: np.ndarray, world: MergedMap, chosen: np.ndarray, *rest: Any) -> Any:
+        rows.append(len(chosen))
+        return at(self, T, world, chosen, *rest)
+
+    monkeypatch.setattr(Linearisation, "at", counting)
+    odometry, _, _ = jump("blade", (9.0, 0.0, 0.0), clouds=1)
+    for k in range(1, 12):
+        rows.clear()
+        caster = sim.Caster(sim.blade(), SMALL)
+        there = sim.HandMotion().pose(0.0)
+        there[0, 3] += 9.0
+        assert odometry.track(caster.cast(there, k), 1000 + k, round(0.5e9) + k * 5_800_000).state == State.LOST
+        assert sum(rows) <= 3 * 8 * recovery.REGISTERED_POINTS
