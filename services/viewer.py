@@ -5,17 +5,17 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from pydantic import Field
 
 from endo3d.schemas import topics
 from endo3d.schemas.messages import Message
 from endo3d.services.runtime.service import Config, Service
-from endo3d.services.views.blueprint import scan_blueprint
-from endo3d.services.views.display import Display
-from endo3d.services.views.sink import FileSink, Sink, ViewerSink
 from endo3d.services.views.viewer_process import ViewerProcess, has_display
+
+if TYPE_CHECKING:  # Rerun takes half a second to import: only the process that shows something waits for it
+    from endo3d.services.views.sink import Sink, ViewerSink
 
 log = logging.getLogger(__name__)
 
@@ -59,6 +59,8 @@ class Viewer(Service[ViewerConfig]):
     nice = 10
 
     def __init__(self, config: ViewerConfig) -> None:
+        from endo3d.services.views.display import Display
+
         super().__init__(config)
         self.display = Display(config.rate_hz, config.cloud_hz, config.map_hz, config.colour)
         self.sinks: list[Sink] = []
@@ -67,6 +69,9 @@ class Viewer(Service[ViewerConfig]):
 
     def open(self) -> None:
         """Starts or finds the viewer, opens the recording. Raises ``UserError``."""
+        from endo3d.services.views.blueprint import scan_blueprint
+        from endo3d.services.views.sink import FileSink, ViewerSink
+
         if self.config.save is not None:
             self.sinks.append(FileSink(self.config.save, scan_blueprint()))
         match self._way():
