@@ -37,9 +37,7 @@ PANELS: dict[str, dict[str, str]] = {
         "check": "Check a stack file and print its dataflow.",
         "run": "Run one service of a stack in this process.",
         "devices": "List cameras and projectors, and try them.",
-        "calibrate": "Calibrate a sensor head.",
         "import": "Turn images of another instrument into a log.",
-        "keys": "Make certificates for a rig that is seen from other hosts.",
     },
 }
 """What ``endo3d --help`` lists: command ``name`` lives in ``services/cli/<name>.py`` as a function ``name``
