@@ -14,6 +14,8 @@ import zenoh
 from endo3d.schemas.topics import Topic
 
 _ASK_S = 2.0
+_TIMES = 5
+"""A writer on a busy machine may be late with its answer: that alone is no reason for alarm."""
 
 
 def key(rig: str, topic: Topic) -> str:
@@ -35,7 +37,9 @@ def map_offered(session: zenoh.Session, key: str, fail: Callable[[], None]) -> z
     """Map the pools that are offered, now and from now on; ``fail`` is called when that can't be."""
 
     def take(token: zenoh.Sample) -> None:
-        if token.kind == zenoh.SampleKind.PUT and not _ask(session, key) and _is_offered(session, key):
+        if token.kind != zenoh.SampleKind.PUT or any(_ask(session, key) for _ in range(_TIMES)):
+            return
+        if _is_offered(session, key):
             fail()
 
     _ask(session, key)
