@@ -8,9 +8,10 @@ Layout: https://mcap.dev/spec, little-endian throughout.
 from __future__ import annotations
 
 import struct
-import zlib
 from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
+
+from isal import isal_zlib
 
 MAGIC = b"\x89MCAP0\r\n"
 
@@ -115,7 +116,8 @@ def chunk_around(records: Sequence[Buffer], start_ns: int, end_ns: int) -> bytes
 
 
 def crc32(parts: Iterable[Buffer]) -> int:
+    """By ISA-L: the same as zlib's, ten times as fast, and every byte of a recording passes here."""
     value = 0
     for part in parts:
-        value = zlib.crc32(part, value)
+        value = isal_zlib.crc32(part, value)
     return value

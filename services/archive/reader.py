@@ -8,7 +8,6 @@ from __future__ import annotations
 import heapq
 import mmap
 import struct
-import zlib
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -16,6 +15,7 @@ from io import BytesIO
 from pathlib import Path
 from typing import NamedTuple
 
+from isal import isal_zlib
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.records import (
@@ -234,7 +234,7 @@ class Log:
             return memoryview(stream.read(index.size))
         records = self._map[index.records_offset : index.records_offset + index.size]
         expected = layout.CHUNK.unpack_from(self._map, index.offset)[5]
-        if check and expected and zlib.crc32(records) != expected:
+        if check and expected and isal_zlib.crc32(records) != expected:
             raise self._damaged(index.offset)
         return records
 
@@ -248,7 +248,7 @@ class Log:
         start, _, crc = FOOTER.unpack_from(self._map, whole - _TAIL_BYTES + layout.RECORD.size)
         if not 0 < start <= whole - _TAIL_BYTES:
             raise Unreadable(f"{self.path} has no index: endo3d recover {self.path}")
-        if crc and zlib.crc32(self._map[start : whole - len(layout.MAGIC) - 4]) != crc:
+        if crc and isal_zlib.crc32(self._map[start : whole - len(layout.MAGIC) - 4]) != crc:
             raise Unreadable(f"the index of {self.path} is damaged: endo3d recover {self.path}")
         return int(start)
 

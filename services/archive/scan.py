@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import struct
-import zlib
 from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import suppress
@@ -11,6 +10,7 @@ from dataclasses import dataclass, field
 from io import BytesIO
 from typing import NamedTuple
 
+from isal import isal_zlib
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
@@ -153,7 +153,7 @@ def _chunk(body: memoryview, at: int, length: int) -> FoundChunk | Damage:
     if name:
         stream, _ = get_chunk_data_stream(Chunk.read(_stream(body)), validate_crc=True)
         records = memoryview(stream.read(size))
-    elif crc and zlib.crc32(records) != crc:
+    elif crc and isal_zlib.crc32(records) != crc:
         return Damage(at, "a chunk's CRC is wrong")
     entries: dict[int, list[tuple[int, int]]] = defaultdict(list)
     definitions: list[Schema | Channel] = []
