@@ -36,7 +36,8 @@ class Topic:
         return f"/{self.name}/{service}" if self.per_service else f"/{self.name}"
 
 
-FRAME = Topic("frame", m.Frame, rate_hz=180, depth=8, bulk=True)
+# Deep enough for a processor that is taken away for a tenth of a second: decoding catches up.
+FRAME = Topic("frame", m.Frame, rate_hz=180, depth=24, bulk=True)
 CLOUD = Topic("cloud", m.Cloud, rate_hz=180, depth=4, bulk=True, log_hz=2)
 DEPTH = Topic("depth", m.DepthMap, rate_hz=180, depth=4, bulk=True, log_hz=30)
 POSE = Topic("pose", m.Pose, rate_hz=180)
