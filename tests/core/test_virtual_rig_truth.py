@@ -199,7 +199,8 @@ def test_points_of_a_blade_satisfy_its_equation() -> None:
 def ball_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finely triangulated sphere of 3 mm, centred on its origin."""
     trimesh = pytest.importorskip("trimesh")
-    pytest.importorskip("embreex", reason="mesh scenes need Embree: pip install 'endo3d[mesh]'")
+    for package in ("embreex", "rtree"):
+        pytest.importorskip(package, reason="mesh scenes need it: pip install 'endo3d[mesh]'")
     path = tmp_path_factory.mktemp("mesh") / "ball.stl"
     trimesh.creation.icosphere(subdivisions=5, radius=3.0).export(path)
     return path
