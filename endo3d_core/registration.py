@@ -291,7 +291,7 @@ def _rows(
         surface[6, used] = w * residual
         tilt = w * tilt_scale / np.sqrt(min(count, f(_AVERAGED)))
         surface[7, used], surface[8, used], surface[9, used], surface[10, used] = tilt, tilt * sx, tilt * sy, tilt * sz
-        surface[11, used] = one - cosine
+        surface[11, used] = max(one - cosine, zero)  # rounding may carry a cosine past one
         used += 1
         if not (facing >= f(FACING) and q[7] == q[7]):
             continue
