@@ -11,12 +11,11 @@ from collections import deque
 from pathlib import Path
 from typing import Any
 
-import cv2
-import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from endo3d.services.devices.bench import Bench, default_path
 from endo3d.services.devices.camera import Shot
+from endo3d.services.devices.grey_image import read_grey
 from endo3d.services.devices.uri import DeviceError, Setting, Uri
 from endo3d_core.slot_identity import Timeline
 
@@ -37,14 +36,10 @@ def open_uri(uri: Uri, setting: Setting) -> FolderCamera:
 
 
 def _read(path: Path) -> NDArray[Any]:
-    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-    if image is None:
-        raise DeviceError(f"{path} can't be read as an image")
-    if image.ndim == 3:
-        image = cv2.cvtColor(image[..., :3], cv2.COLOR_BGR2GRAY)
-    if image.dtype not in (np.uint8, np.uint16):
-        raise DeviceError(f"{path} has {image.dtype} pixels; 8 or 16 bits are read")
-    return image
+    try:
+        return read_grey(path)
+    except ValueError as error:
+        raise DeviceError(str(error)) from error
 
 
 class FolderCamera:

@@ -7,10 +7,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import cv2
-import numpy as np
 from numpy.typing import NDArray
 
+from endo3d.services.devices.grey_image import read_grey
 from endo3d.services.runtime.errors import UserError
 
 SUFFIXES = frozenset({".png", ".tif", ".tiff", ".bmp"})
@@ -45,13 +44,10 @@ def images(paths: list[Path], shape: tuple[int, int]) -> Iterator[NDArray[Any]]:
     """(height, width) uint8 or uint16 each; ``shape`` is the calibration's. Raises ``UserError``."""
     first: NDArray[Any] | None = None
     for path in paths:
-        image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-        if image is None:
-            raise UserError(f"{path} can't be read as an image; convert it to png or tif")
-        if image.ndim == 3:
-            image = cv2.cvtColor(image[..., :3], cv2.COLOR_BGR2GRAY)
-        if image.dtype not in (np.uint8, np.uint16):
-            raise UserError(f"{path} has {image.dtype} pixels; images have 8 or 16 bits")
+        try:
+            image = read_grey(path)
+        except ValueError as error:
+            raise UserError(str(error)) from error
         first = image if first is None else first
         if image.shape != first.shape or image.dtype != first.dtype:
             raise UserError(
