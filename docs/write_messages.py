@@ -22,6 +22,7 @@ FOXGLOVE = {
     "points": "data",
     "depth": "data",
     "T_world_camera": "pose",
+    "T_part_camera": "pose",
     "T_parent_child": "translation, rotation",
     "dist": "D",
     "service": "name",

@@ -72,6 +72,7 @@ _WAYS = {
         _Way(topics.DEPTH, arrays.fill_depth, arrays.read_depth, "depth"),
         _Way(topics.MAP, arrays.fill_map, arrays.read_map, "points"),
         _Way(topics.POSE, small.fill_pose, small.read_pose),
+        _Way(topics.PART_POSE, small.fill_part_pose, small.read_part_pose),
         _Way(topics.TRANSFORM, small.fill_frame_transform, small.read_frame_transform),
         _Way(topics.MODE, small.fill_mode, small.read_mode),
         _Way(topics.CAMERA, small.fill_camera, small.read_camera),

@@ -97,6 +97,40 @@ class PoseHealth(_message.Message):
     newest_stamp_ns: int
     def __init__(self, sequence: _Optional[int] = ..., state: _Optional[_Union[PoseHealth.Tracking, str]] = ..., information: _Optional[_Iterable[float]] = ..., sigma_weak_um: _Optional[float] = ..., weak_direction: _Optional[_Iterable[float]] = ..., inlier_share: _Optional[float] = ..., residual_um: _Optional[float] = ..., photometric_share: _Optional[float] = ..., submap: _Optional[int] = ..., newest_stamp_ns: _Optional[int] = ...) -> None: ...
 
+class PartHealth(_message.Message):
+    __slots__ = ("sequence", "state", "tracking", "information", "sigma_weak_um", "weak_direction", "inlier_share", "residual_um", "model")
+    class Fit(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+        __slots__ = ()
+        UNSPECIFIED: _ClassVar[PartHealth.Fit]
+        SEARCHING: _ClassVar[PartHealth.Fit]
+        ALIGNED: _ClassVar[PartHealth.Fit]
+        DEGENERATE: _ClassVar[PartHealth.Fit]
+        LOST: _ClassVar[PartHealth.Fit]
+    UNSPECIFIED: PartHealth.Fit
+    SEARCHING: PartHealth.Fit
+    ALIGNED: PartHealth.Fit
+    DEGENERATE: PartHealth.Fit
+    LOST: PartHealth.Fit
+    SEQUENCE_FIELD_NUMBER: _ClassVar[int]
+    STATE_FIELD_NUMBER: _ClassVar[int]
+    TRACKING_FIELD_NUMBER: _ClassVar[int]
+    INFORMATION_FIELD_NUMBER: _ClassVar[int]
+    SIGMA_WEAK_UM_FIELD_NUMBER: _ClassVar[int]
+    WEAK_DIRECTION_FIELD_NUMBER: _ClassVar[int]
+    INLIER_SHARE_FIELD_NUMBER: _ClassVar[int]
+    RESIDUAL_UM_FIELD_NUMBER: _ClassVar[int]
+    MODEL_FIELD_NUMBER: _ClassVar[int]
+    sequence: int
+    state: PartHealth.Fit
+    tracking: PoseHealth.Tracking
+    information: _containers.RepeatedScalarFieldContainer[float]
+    sigma_weak_um: float
+    weak_direction: _containers.RepeatedScalarFieldContainer[float]
+    inlier_share: float
+    residual_um: float
+    model: str
+    def __init__(self, sequence: _Optional[int] = ..., state: _Optional[_Union[PartHealth.Fit, str]] = ..., tracking: _Optional[_Union[PoseHealth.Tracking, str]] = ..., information: _Optional[_Iterable[float]] = ..., sigma_weak_um: _Optional[float] = ..., weak_direction: _Optional[_Iterable[float]] = ..., inlier_share: _Optional[float] = ..., residual_um: _Optional[float] = ..., model: _Optional[str] = ...) -> None: ...
+
 class MapLabel(_message.Message):
     __slots__ = ("sequence", "removed", "revision", "reset", "map_points", "merging_distance_mm")
     SEQUENCE_FIELD_NUMBER: _ClassVar[int]

@@ -120,6 +120,40 @@ class Pose:
     frame_id: str = "world"
 
 
+class Fit(StrEnum):
+    SEARCHING = "searching"
+    ALIGNED = "aligned"
+    DEGENERATE = "degenerate"
+    LOST = "lost"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PartPose:
+    """Where the tip is in the coordinates of a part's CAD model (foxglove.PoseInFrame + endo3d.PartHealth)."""
+
+    stamp_ns: int
+    sequence: int
+    T_part_camera: NDArray[np.float64]
+    """(4, 4), mm; the coordinates are the model file's."""
+    information: NDArray[np.float64]
+    """(6, 6) of (translation mm, rotation rad) in the camera frame; zero while searching or lost."""
+    state: Fit
+    """How the scan lies on the model; ``degenerate``: it may still slide along ``weak_direction``."""
+    tracking: Tracking
+    """Of the odometry pose it rests on."""
+    sigma_weak_um: float
+    """1-sigma along the weakest direction, rotation scaled to um at the working distance."""
+    weak_direction: NDArray[np.float64]
+    """(6,) unit vector of that direction."""
+    inlier_share: float
+    """Of the visible map points, those that lie on the model."""
+    residual_um: float
+    """Their robust rms distance from it."""
+    model: str = ""
+    """The model's file name."""
+    frame_id: str = "part"
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Transform:
     """A rigid transform for viewers (foxglove.FrameTransform)."""
@@ -271,6 +305,7 @@ Message = (
     | Cloud
     | DepthMap
     | Pose
+    | PartPose
     | Transform
     | MapDelta
     | Mode

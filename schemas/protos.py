@@ -45,6 +45,7 @@ _SOURCES: dict[Topic, tuple[FileDescriptor, str, str | None]] = {
     topics.CLOUD: (PointCloud_pb2.DESCRIPTOR, "foxglove.PointCloud", "endo3d.CloudLabel"),
     topics.DEPTH: (RawImage_pb2.DESCRIPTOR, "foxglove.RawImage", "endo3d.DepthLabel"),
     topics.POSE: (PoseInFrame_pb2.DESCRIPTOR, "foxglove.PoseInFrame", "endo3d.PoseHealth"),
+    topics.PART_POSE: (PoseInFrame_pb2.DESCRIPTOR, "foxglove.PoseInFrame", "endo3d.PartHealth"),
     topics.TRANSFORM: (FrameTransform_pb2.DESCRIPTOR, "foxglove.FrameTransform", None),
     topics.MAP: (PointCloud_pb2.DESCRIPTOR, "foxglove.PointCloud", "endo3d.MapLabel"),
     topics.MODE: (endo3d_pb2.DESCRIPTOR, "endo3d.Mode", None),

@@ -18,9 +18,11 @@ from endo3d.schemas import endo3d_pb2
 from endo3d.schemas.geometry import fill_stamp, fill_transform, read_matrix, read_stamp, read_transform
 from endo3d.schemas.messages import (
     CameraCalibration,
+    Fit,
     Level,
     LogLine,
     Mode,
+    PartPose,
     Pose,
     ProjectorCalibration,
     ServiceState,
@@ -33,6 +35,8 @@ from endo3d.schemas.wire import Malformed
 
 _TRACKING = {state: endo3d_pb2.PoseHealth.Tracking.Value(state.name) for state in Tracking}
 _TRACKING_OF = {number: state for state, number in _TRACKING.items()}
+_FIT = {fit: endo3d_pb2.PartHealth.Fit.Value(fit.name) for fit in Fit}
+_FIT_OF = {number: fit for fit, number in _FIT.items()}
 _STATE = {state: endo3d_pb2.Status.State.Value(state.name) for state in ServiceState}
 _STATE_OF = {number: state for state, number in _STATE.items()}
 _LEVEL = {level: LogProto.Level.Value(level.name) for level in Level}
@@ -102,6 +106,57 @@ def read_pose(proto: Any) -> Pose:
         photometric_share=label.photometric_share,
         submap=label.submap,
         newest_stamp_ns=label.newest_stamp_ns,
+        frame_id=proto.frame_id,
+    )
+
+
+def fill_part_pose(proto: Any, pose: PartPose) -> None:
+    fill_stamp(proto.timestamp, pose.stamp_ns)
+    proto.frame_id = pose.frame_id
+    fill_transform(proto.pose.position, proto.pose.orientation, pose.T_part_camera)
+    label = proto.label
+    label.sequence = pose.sequence
+    label.state = _FIT[pose.state]
+    label.tracking = _TRACKING[pose.tracking]
+    label.information.extend(_flat(pose.information, (6, 6), "information"))
+    label.sigma_weak_um = pose.sigma_weak_um
+    label.weak_direction.extend(_flat(pose.weak_direction, (6,), "weak_direction"))
+    label.inlier_share = pose.inlier_share
+    label.residual_um = pose.residual_um
+    label.model = pose.model
+
+
+def read_part_pose(proto: Any) -> PartPose:
+    """A foreign pose is aligned, and nothing is known about how well."""
+    stamp_ns = read_stamp(proto.timestamp)
+    T = read_transform(proto.pose.position, proto.pose.orientation, proto.pose.HasField("orientation"))
+    if not proto.HasField("label"):
+        return PartPose(
+            stamp_ns=stamp_ns,
+            sequence=0,
+            T_part_camera=T,
+            information=np.zeros((6, 6)),
+            state=Fit.ALIGNED,
+            tracking=Tracking.TRACKING,
+            sigma_weak_um=math.nan,
+            weak_direction=np.full(6, np.nan),
+            inlier_share=math.nan,
+            residual_um=math.nan,
+            frame_id=proto.frame_id,
+        )
+    label = proto.label
+    return PartPose(
+        stamp_ns=stamp_ns,
+        sequence=label.sequence,
+        T_part_camera=T,
+        information=read_matrix(label.information, 6, 6, "information"),
+        state=_known(_FIT_OF, label.state, "fit"),
+        tracking=_known(_TRACKING_OF, label.tracking, "tracking state"),
+        sigma_weak_um=label.sigma_weak_um,
+        weak_direction=read_matrix(label.weak_direction, 1, 6, "weak_direction")[0],
+        inlier_share=label.inlier_share,
+        residual_um=label.residual_um,
+        model=label.model,
         frame_id=proto.frame_id,
     )
 

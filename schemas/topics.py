@@ -41,6 +41,7 @@ FRAME = Topic("frame", m.Frame, rate_hz=180, depth=24, bulk=True)
 CLOUD = Topic("cloud", m.Cloud, rate_hz=180, depth=4, bulk=True, log_hz=2)
 DEPTH = Topic("depth", m.DepthMap, rate_hz=180, depth=4, bulk=True, log_hz=30)
 POSE = Topic("pose", m.Pose, rate_hz=180)
+PART_POSE = Topic("part_pose", m.PartPose, rate_hz=180)
 TRANSFORM = Topic("transform", m.Transform, rate_hz=180)
 MAP = Topic("map", m.MapDelta, rate_hz=30)
 MODE = Topic("mode", m.Mode, rate_hz=10, latched=True)
@@ -50,7 +51,7 @@ TRUTH = Topic("truth", m.Truth, rate_hz=180)
 STATUS = Topic("status", m.Status, rate_hz=2, per_service=True)
 LOG = Topic("log", m.LogLine, rate_hz=100, per_service=True)
 
-TOPICS = (FRAME, CLOUD, DEPTH, POSE, TRANSFORM, MAP, MODE, CAMERA, PROJECTOR, TRUTH, STATUS, LOG)
+TOPICS = (FRAME, CLOUD, DEPTH, POSE, PART_POSE, TRANSFORM, MAP, MODE, CAMERA, PROJECTOR, TRUTH, STATUS, LOG)
 BY_NAME = {topic.name: topic for topic in TOPICS}
 BY_MESSAGE = {topic.message: topic for topic in TOPICS}
 

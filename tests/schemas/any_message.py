@@ -121,6 +121,21 @@ poses = st.builds(
     newest_stamp_ns=stamps,
     frame_id=texts,
 )
+part_poses = st.builds(
+    m.PartPose,
+    stamp_ns=stamps,
+    sequence=counts,
+    T_part_camera=transforms(),
+    information=matrices(6, 6),
+    state=st.sampled_from(m.Fit),
+    tracking=st.sampled_from(m.Tracking),
+    sigma_weak_um=figures,
+    weak_direction=matrices(6),
+    inlier_share=figures,
+    residual_um=figures,
+    model=texts,
+    frame_id=texts,
+)
 frame_transforms = st.builds(
     m.Transform, stamp_ns=stamps, parent_frame_id=texts, child_frame_id=texts, T_parent_child=transforms()
 )
@@ -203,6 +218,7 @@ MESSAGES = {
     topics.CLOUD: clouds,
     topics.DEPTH: depths,
     topics.POSE: poses,
+    topics.PART_POSE: part_poses,
     topics.TRANSFORM: frame_transforms,
     topics.MAP: maps,
     topics.MODE: modes,
@@ -260,6 +276,19 @@ _EXAMPLES: dict[topics.Topic, m.Message] = {
             2,
             _STAMP + 72_000_000,
         ),
+        m.PartPose(
+            _STAMP,
+            41,
+            _T,
+            np.diag([4.0, 4, 9, 100, 100, 50]),
+            m.Fit.DEGENERATE,
+            m.Tracking.TRACKING,
+            12.5,
+            np.array([0, 1.0, 0, 0, 0, 0]),
+            0.75,
+            8.5,
+            "blade.stl",
+        ),
         m.Transform(_STAMP, "world", "camera", _T),
         m.MapDelta(
             _STAMP,
@@ -302,7 +331,7 @@ def assert_equal(one: m.Message, other: m.Message, rotation_tolerance: float = 1
     assert type(one) is type(other)
     for field in dataclasses.fields(one):
         a, b = getattr(one, field.name), getattr(other, field.name)
-        if field.name in ("T_world_camera", "T_parent_child"):
+        if field.name in ("T_world_camera", "T_part_camera", "T_parent_child"):
             np.testing.assert_allclose(a[:3, :3], b[:3, :3], rtol=0, atol=rotation_tolerance)
             np.testing.assert_array_equal(a[:, 3], b[:, 3])
         elif isinstance(a, np.ndarray):

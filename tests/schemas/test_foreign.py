@@ -22,6 +22,7 @@ STOCK = {
     topics.CLOUD: PointCloud,
     topics.DEPTH: RawImage,
     topics.POSE: PoseInFrame,
+    topics.PART_POSE: PoseInFrame,
     topics.TRANSFORM: FrameTransform,
     topics.MAP: PointCloud,
     topics.MODE: endo3d_pb2.Mode,
@@ -182,6 +183,9 @@ def test_a_stock_cloud_is_a_whole_map():
 
 def test_a_stock_pose_tracks_and_knows_nothing_else():
     pose = codec.decode(topics.POSE, PoseInFrame(frame_id="lab").SerializeToString())
+    on_part = codec.decode(topics.PART_POSE, PoseInFrame(frame_id="lab").SerializeToString())
+    assert on_part.state is messages.Fit.ALIGNED
+    assert not on_part.information.any()
     np.testing.assert_array_equal(pose.T_world_camera, np.eye(4))
     assert pose.state is messages.Tracking.TRACKING
     assert np.isnan([pose.sigma_weak_um, pose.inlier_share, pose.residual_um, pose.photometric_share]).all()

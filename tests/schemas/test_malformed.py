@@ -181,6 +181,7 @@ def assign(path, value):
         (topics.POSE, assign("label.state", 9), "tracking state 9"),
         (topics.POSE, assign("pose.orientation.x", float("nan")), "not a rotation"),
         (topics.POSE, lambda proto: proto.label.information.pop(), "information has 35"),
+        (topics.PART_POSE, assign("label.state", 9), "fit 9"),
         (topics.POSE, lambda proto: proto.label.weak_direction.append(0), "weak_direction has 7"),
         (topics.TRANSFORM, lambda proto: proto.rotation.Clear(), "not a rotation"),
         (topics.CAMERA, assign("distortion_model", "kannala_brandt"), "kannala_brandt"),
@@ -203,6 +204,7 @@ def test_a_wrong_utf8_text_is_malformed(topic):
     raw = ENCODED[topic].replace(b"camera", b"\xff\xfemera").replace(b"decoder", b"\xff\xfecoder")
     raw = raw.replace(b"interleaved", b"\xff\xfeterleaved").replace(b"contour", b"\xff\xfentour")
     raw = raw.replace(b"world", b"\xff\xferld").replace(b"projector", b"\xff\xfeojector")
+    raw = raw.replace(b"part", b"\xff\xfert")
     assert raw != ENCODED[topic]
     with pytest.raises(codec.Malformed, match="not a "):
         codec.decode(topic, raw)

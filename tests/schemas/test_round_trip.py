@@ -33,7 +33,7 @@ def test_equal_messages_give_equal_bytes(message):
 
 @pytest.mark.parametrize(
     "topic",
-    [t for t in topics.TOPICS if t not in (topics.POSE, topics.TRANSFORM)],
+    [t for t in topics.TOPICS if t not in (topics.POSE, topics.PART_POSE, topics.TRANSFORM)],
     ids=lambda topic: topic.name,
 )
 def test_what_was_decoded_encodes_to_the_same_bytes(topic):
@@ -104,6 +104,8 @@ def test_strided_arrays_are_gathered():
         (topics.POSE, {"T_world_camera": np.diag([1.0, 1, -1, 1])}, "rotation"),
         (topics.POSE, {"T_world_camera": np.eye(3)}, r"\(4, 4\)"),
         (topics.POSE, {"information": np.eye(5)}, r"\(6, 6\)"),
+        (topics.PART_POSE, {"T_part_camera": np.zeros((4, 4))}, "rotation"),
+        (topics.PART_POSE, {"information": np.eye(5)}, r"\(6, 6\)"),
         (topics.PROJECTOR, {"dist": np.zeros(4)}, r"\(5,\)"),
     ],
 )
