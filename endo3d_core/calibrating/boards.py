@@ -58,6 +58,12 @@ class Board:
         return cls(kind, columns, rows, pitch_mm, marker_mm, dictionary)  # type: ignore[arg-type]
 
     @property
+    def text(self) -> str:
+        """The canonical text; ``parse(board.text) == board``."""
+        words = f"{self.kind} {self.columns}x{self.rows} pitch={self.pitch_mm:g}"
+        return words + (f" marker={self.marker_mm:g} dictionary={self.dictionary}" if self.kind == "charuco" else "")
+
+    @property
     def points_mm(self) -> NDArray[np.float64]:
         """(n, 3) all features in the order that OpenCV finds them, z = 0."""
         if self.kind == "charuco":
@@ -103,6 +109,11 @@ class Board:
             return None
         clear = (1 - self.marker_mm / self.pitch_mm) / 2  # of a square: where the nearest marker begins
         return self.points_mm[np.asarray(ids).ravel()], _refined(image, _pixels(corners), clear)
+
+    def drawn(self, square_px: int) -> NDArray[np.uint8]:
+        """A ChArUco board as OpenCV draws it: (rows, columns) times ``square_px``, 0 or 255."""
+        size = (self.columns * square_px, self.rows * square_px)
+        return np.asarray(self._charuco().generateImage(size), np.uint8)
 
     def _charuco(self) -> Any:
         dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{self.dictionary}"))

@@ -6,6 +6,7 @@
     steps heights=0.05/0.1/0.2/0.5 width=1.5
     contour                             the micro-contour standard of the paper
     blade size=1                        a freeform surface like a turbine blade's, 10 mm of chord
+    board print=checkerboard,9x7,pitch=1    a printed calibration board: ``Board.parse``, with commas
     mesh file=part.stl scale=1          any STL or PLY mesh, in mm; z points away from the sensor
     sphere r=1 at=0,0,19 + plane z=20
 
@@ -23,7 +24,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from endo3d_core.calibrating.boards import Board
 from endo3d_core.virtual_rig import freeform, mesh
+from endo3d_core.virtual_rig.board import Print
 from endo3d_core.virtual_rig.contour_standard import contour_standard
 from endo3d_core.virtual_rig.material import METAL, Material, Texture
 from endo3d_core.virtual_rig.mesh import Mesh
@@ -71,7 +74,7 @@ class Scene:
     bodies: tuple[Body, ...]
 
 
-KINDS = ("plane", "sphere", "cylinder", "steps", "contour", "blade", "mesh")
+KINDS = ("plane", "sphere", "cylinder", "steps", "contour", "blade", "board", "mesh")
 
 
 def parse(text: str, working_distance_mm: float = 20.0) -> Scene:
@@ -97,7 +100,7 @@ def _body(text: str, working_distance_mm: float) -> Body:
 
 def _shape(words: Words) -> Shape:
     match words.kind:
-        case "plane":
+        case "plane" | "board":
             return Contour(-PLANE_REACH_MM, 0.0).line(PLANE_REACH_MM, 0.0).profile()
         case "sphere":
             return Sphere(_positive(words, "r", 1.0))
@@ -148,10 +151,15 @@ def _material(words: Words) -> Material:
         raise ValueError(f"scene {words.kind!r}: albedo={albedo:g} must lie in 0..1")
     return Material(
         albedo,
-        _texture(words.kind, words.text_of("texture", "none")),
+        _print(words) if words.kind == "board" else _texture(words.kind, words.text_of("texture", "none")),
         words.number("specular", base["specular"]),
         words.number("gloss", base["gloss"]),
     )
+
+
+def _print(words: Words) -> Texture:
+    board = Board.parse(words.text_of("print", "checkerboard,11x9,pitch=0.8").replace(",", " "))
+    return Print(text=board.text)
 
 
 def _texture(kind: str, text: str) -> Texture:
