@@ -65,61 +65,62 @@ class MergedMap:
             raise ValueError(f"a merging distance of {merging_distance_mm} mm is not within 0.001..10")
         self.merging_distance_mm = merging_distance_mm
         self.capacity = capacity
+        # The hash table, its rows and their bookkeeping: ``map_rows`` works on them too.
         slots = 1 << max(math.ceil(math.log2(2 * capacity)), 4)
-        self._keys = np.full(slots, voxel_hash.EMPTY, np.int64)
-        self._index = np.zeros(slots, np.int32)
+        self.keys = np.full(slots, voxel_hash.EMPTY, np.int64)
+        self.index = np.zeros(slots, np.int32)
         self.rows = np.zeros((capacity, ROW), np.float32)
         self.ints = self.rows.view(np.int32)
-        self._tags = np.zeros((capacity, TAG), np.int16)
-        self._moved = np.zeros(capacity, np.float32)
-        self._free = np.empty(capacity, np.int32)
-        self._dirty = np.empty(capacity, np.int32)
+        self.tags = np.zeros((capacity, TAG), np.int16)
+        self.moved = np.zeros(capacity, np.float32)
+        self.free = np.empty(capacity, np.int32)
+        self.dirty = np.empty(capacity, np.int32)
         self._removed = np.empty((capacity, 3), np.int16)
         self._touched = np.empty(1, np.int32)
-        self._counters = np.zeros(8, np.int64)
+        self.counters = np.zeros(8, np.int64)
         self.clear()
 
     def clear(self) -> None:
-        self._keys[:] = voxel_hash.EMPTY
+        self.keys[:] = voxel_hash.EMPTY
         self.ints[: self.used, COUNT] = 0
-        self._counters[:] = 0
+        self.counters[:] = 0
 
     # The kernels' counters: rows ever used, free rows, dirty rows, removed keys, touched rows, sweep position, refused
     # points, first cloud.
     @property
     def used(self) -> int:
         """Rows in use or free again: every live row lies below."""
-        return int(self._counters[0])
+        return int(self.counters[0])
 
     @property
     def count(self) -> int:
         """Map points, unconfirmed ones included."""
-        return int(self._counters[0] - self._counters[1])
+        return int(self.counters[0] - self.counters[1])
 
     @property
     def refused(self) -> int:
         """Points that found no room since the map was made."""
-        return int(self._counters[6])
+        return int(self.counters[6])
 
     @property
     def touched(self) -> NDArray[np.int32]:
         """Rows that the last cloud was merged into, in the order of its grid: the visible part of the map."""
-        return self._touched[: self._counters[4]]
+        return self._touched[: self.counters[4]]
 
     def merge(self, live: NDArray[np.float32], T_world_camera: NDArray[np.float64], sequence: int) -> None:
         """Merges the points of ``live`` (rows, columns, LIVE), seen from a pose (4, 4), as cloud ``sequence``."""
         if self.count == 0:
-            self._counters[7] = sequence
+            self.counters[7] = sequence
         if self._touched.size < live.shape[0] * live.shape[1]:
             self._touched = np.empty(live.shape[0] * live.shape[1], np.int32)
         _merge(
             live, np.ascontiguousarray(T_world_camera, np.float64), self.merging_distance_mm, sequence,
-            self._keys, self._index, self.rows, self.ints, self._tags, self._moved,
-            self._free, self._dirty, self._touched, self._counters,
+            self.keys, self.index, self.rows, self.ints, self.tags, self.moved,
+            self.free, self.dirty, self._touched, self.counters,
         )  # fmt: skip
         _sweep(
-            sequence, min(_SWEPT, self.used), self._keys, self._index, self.ints, self._tags,
-            self._free, self._removed, self._counters,
+            sequence, min(_SWEPT, self.used), self.keys, self.index, self.ints, self.tags,
+            self.free, self._removed, self.counters,
         )  # fmt: skip
 
     def confirmed(self, at_least: int = CONFIRMED) -> NDArray[np.int32]:
@@ -132,16 +133,16 @@ class MergedMap:
 
     def take_delta(self) -> Delta:
         """What is new, moved by more than 2 um or doubled its count since the last call."""
-        dirty = np.unique(self._dirty[: self._counters[2]])
+        dirty = np.unique(self.dirty[: self.counters[2]])
         dirty = dirty[self.ints[dirty, COUNT] >= CONFIRMED]
-        delta = Delta(self._published(dirty), self._removed[: self._counters[3]].copy())
-        _mark_published(dirty, self.ints, self._tags, self._moved)
-        self._counters[2:4] = 0
+        delta = Delta(self._published(dirty), self._removed[: self.counters[3]].copy())
+        _mark_published(dirty, self.ints, self.tags, self.moved)
+        self.counters[2:4] = 0
         return delta
 
     def _published(self, rows: NDArray[np.int32]) -> NDArray[np.void]:
         out = np.zeros(len(rows), MAP_POINT)
-        values, ints, tags = self.rows[rows], self.ints[rows], self._tags[rows]
+        values, ints, tags = self.rows[rows], self.ints[rows], self.tags[rows]
         for i, name in enumerate(("x", "y", "z", "nx", "ny", "nz", "intensity")):
             out[name] = values[:, i]
         out["sigma"] = np.sqrt(values[:, VARIANCE])

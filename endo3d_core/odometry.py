@@ -102,6 +102,10 @@ class Odometry:
         self._visible = self.map.touched
         self._merged += 1
 
+    def _forget(self) -> None:
+        """Nothing of the old map helps any more."""
+        self.map.clear()
+
     def _load(self, channels: NDArray[np.float32]) -> int:
         """The number of pooled points; 0 also when nothing can be told from the cloud."""
         try:
@@ -154,7 +158,7 @@ class Odometry:
         self._failures += 1
         if self._merged < _HARDLY_A_MAP or self._failures > _PATIENCE:
             self.submap += self._merged >= _HARDLY_A_MAP
-            self.map.clear()
+            self._forget()
             return self._begin(stamp_ns)
         return self._lost()
 

@@ -1,8 +1,9 @@
 """A pose graph along a path: consecutive poses joined by odometry, some far ones by loops that were found.
 
-Gauss-Newton on SE(3) (Grisetti et al., A tutorial on graph-based SLAM, IEEE ITSM 2:31, 2010). Loops count by Cauchy
-weights whose scale narrows from "all believed" to ``LOOP_SCALE`` (graduated non-convexity: Yang et al., IEEE RA-L 5:1127,
-2020), so that a wrong loop that contradicts the others loses its pull instead of bending the path.
+Gauss-Newton on SE(3) (Grisetti et al., A tutorial on graph-based SLAM, IEEE ITSM 2:31, 2010). Loops count by robust
+weights whose scale narrows from "all believed" to ``LOOP_SCALE`` (Geman and McClure; graduated non-convexity: Yang et
+al., IEEE RA-L 5:1127, 2020), so that a wrong loop that contradicts the others loses its pull instead of bending the
+path.
 
 The path makes the normal equations block tridiagonal; that part, solved exactly, preconditions conjugate gradients,
 and each loop costs them about one iteration. The work comes in pieces that stay below a camera's period.
@@ -24,7 +25,7 @@ from endo3d_core.compiled import exact
 Array = NDArray[np.float64]
 
 LOOP_SCALE = 3.0
-"""Cauchy scale of a loop's misfit, in its own sigmas."""
+"""Robust scale of a loop's misfit, in its own sigmas."""
 _NARROWING = 0.25
 """Of the squared scale, from one Gauss-Newton step to the next."""
 _STEPS = 30
@@ -52,10 +53,10 @@ class PoseGraph:
     def __init__(self) -> None:
         self.poses: Array = np.empty((0, 4, 4))
         """(n, 4, 4) as optimised last; new ones hang on the one before."""
+        self.path: list[Edge] = []
         self.loops: list[Edge] = []
         self.trust: Array = np.empty(0)
         """(loops,) 0..1: how far each loop was believed in the last optimisation."""
-        self._path: list[Edge] = []
 
     def add(self, T_before_node: Array, information: Array) -> int:
         """A new pose at the end of the path, as odometry says; its number."""
@@ -63,7 +64,7 @@ class PoseGraph:
             self.poses = np.asarray(T_before_node, np.float64)[None]
             return 0
         j = len(self.poses)
-        self._path.append(Edge(j - 1, j, T_before_node, information))
+        self.path.append(Edge(j - 1, j, T_before_node, information))
         self.poses = np.concatenate([self.poses, (self.poses[-1] @ T_before_node)[None]])
         return j
 
@@ -75,7 +76,7 @@ class PoseGraph:
         """Moves ``poses`` to the optimum; poses and loops that are added meanwhile wait for the next time."""
         poses = self.poses.copy()
         n = len(poses)
-        edges = [*self._path[: n - 1], *self.loops]
+        edges = [*self.path[: n - 1], *self.loops]
         first = np.array([edge.i for edge in edges], np.int64)
         second = np.array([edge.j for edge in edges], np.int64)
         measured = np.array([edge.T_i_j for edge in edges]).reshape(-1, 4, 4)
@@ -93,7 +94,8 @@ class PoseGraph:
             equations = _Equations(n, first, second, error, J_i, J_j, weighted)
             yield
             step = np.zeros((n, 6))
-            for step in equations.solutions():
+            for better in equations.solutions():
+                step = better
                 yield
             poses = poses @ _exponentials(step)
             if scale2 == LOOP_SCALE**2 and np.abs(step).max() < _CONVERGED:

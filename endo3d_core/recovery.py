@@ -66,7 +66,7 @@ class Search:
         self._next = self._next + SCORED_POSES if self._next + SCORED_POSES < len(self._shifts) else 0
         poses = self._T_last @ tried @ self._levelling
         few = self.rows[:: max(len(self.rows) // SCORED_POINTS, 1)]
-        scores = _scores(self._world.rows, few, view.live, view.coefficients, rigid.inverse(poses), 2.0 * view.pitch_mm)
+        score = scores(self._world.rows, few, view.live, view.coefficients, rigid.inverse(poses), 2.0 * view.pitch_mm)
         best = poses[np.argmax(scores)]
         refined = self._refine(best, view, frame, linearisation)
         if refined is None:
@@ -142,7 +142,7 @@ def shifts(frame: Frame6, view: LiveView) -> Array:
 
 
 @kernel
-def _scores(map_rows: Any, chosen: Any, live: Any, coefficients: Any, poses: Any, gate: Any) -> Any:
+def scores(map_rows: Any, chosen: Any, live: Any, coefficients: Any, poses: Any, gate: Any) -> Any:
     """poses (n, 4, 4) T_camera_world -> (n,): share of points in place, times agreement of their texture."""
     f = np.float32
     rows, columns = live.shape[0], live.shape[1]

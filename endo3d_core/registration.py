@@ -11,14 +11,14 @@ rotation scaled by the surface's radius: all six numbers are mm and comparable.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from endo3d_core import rigid
 from endo3d_core.compiled import kernel
-from endo3d_core.merging import COUNT, MergedMap
+from endo3d_core.merging import COUNT
 
 Array = NDArray[np.float64]
 
@@ -111,6 +111,15 @@ def visible_surface(live: NDArray[np.float32], stride: int = 8) -> Frame6:
     return Frame6(centre, float(np.sqrt(((points - centre) ** 2).sum(axis=1).mean())))
 
 
+class Points(Protocol):
+    """Map points to register to: a merged map, or a part of an old one."""
+
+    rows: NDArray[np.float32]
+    """(n, ROW), as ``merging`` lays them out."""
+    ints: NDArray[np.int32]
+    """The same bytes."""
+
+
 class Linearisation:
     """Builds normal equations at a pose; owns the rows."""
 
@@ -121,7 +130,7 @@ class Linearisation:
     def at(
         self,
         T_world_camera: Array,
-        world: MergedMap,
+        world: Points,
         chosen: NDArray[np.int32],
         live: NDArray[np.float32],
         coefficients: NDArray[np.float32],

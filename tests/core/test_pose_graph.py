@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 from scipy.optimize import least_squares
 
@@ -27,7 +29,7 @@ def drifting(truth: np.ndarray, seed: int = 3) -> PoseGraph:
     """The path as an odometry with ``ODOMETRY``'s noise would tell it."""
     rng, graph = np.random.default_rng(seed), PoseGraph()
     graph.add(truth[0], np.zeros((6, 6)))
-    for before, after in zip(truth[:-1], truth[1:], strict=True):
+    for before, after in itertools.pairwise(truth):
         noise = rng.normal(0.0, 1.0, 6) / np.sqrt(np.diag(ODOMETRY))
         graph.add(rigid.inverse(before) @ after @ rigid.exp(noise), ODOMETRY)
     return graph
@@ -53,7 +55,7 @@ def test_the_optimum_is_scipys() -> None:
     graph.close(loop(truth, 0, 7, (0.002, -0.001, 0.0, 0.0, 0.0002, 0.0)))
     graph.close(loop(truth, 1, 6, (-0.001, 0.0, 0.001, 0.0, 0.0, -0.0001)))
     start = graph.poses.copy()
-    edges = [*graph._path, *graph.loops]
+    edges = [*graph.path, *graph.loops]
     run(graph)
 
     def residuals(x: np.ndarray) -> np.ndarray:
