@@ -33,7 +33,7 @@ class Retirement:
         self._out = np.empty((amount, ROW), np.float32)
 
     def take(self, before: int) -> Rows:
-        """The confirmed ones (a copy) of the next rows that were last seen before cloud ``before``; they are evicted."""
+        """Evicts the next rows that were last seen before cloud ``before``; a copy of the confirmed ones."""
         world = self._world
         amount = min(len(self._out), world.used)
         count = _retire(
@@ -54,8 +54,8 @@ def absorb(world: MergedMap, rows: Rows) -> None:
 
 @kernel
 def _retire(
-    before: Any, amount: Any, position: Any, out: Any, keys: Any, index: Any, rows: Any, ints: Any, tags: Any, free: Any,
-    counters: Any,
+    before: Any, amount: Any, position: Any, out: Any, keys: Any, index: Any, rows: Any, ints: Any, tags: Any,
+    free: Any, counters: Any,
 ) -> Any:  # fmt: skip
     count = 0
     for _ in range(amount):

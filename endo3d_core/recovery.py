@@ -66,8 +66,8 @@ class Search:
         self._next = self._next + SCORED_POSES if self._next + SCORED_POSES < len(self._shifts) else 0
         poses = self._T_last @ tried @ self._levelling
         few = self.rows[:: max(len(self.rows) // SCORED_POINTS, 1)]
-        score = scores(self._world.rows, few, view.live, view.coefficients, rigid.inverse(poses), 2.0 * view.pitch_mm)
-        best = poses[np.argmax(scores)]
+        found = scores(self._world.rows, few, view.live, view.coefficients, rigid.inverse(poses), 2.0 * view.pitch_mm)
+        best = poses[np.argmax(found)]
         refined = self._refine(best, view, frame, linearisation)
         if refined is None:
             return None
