@@ -4,13 +4,15 @@ PYTHON ?= python3
 BIN := .venv/bin
 INSTALLED := .venv/installed
 
-.PHONY: help demo test check bench wheel clean
+.PHONY: help demo test check bench faults soak wheel clean
 
 help:
 	@echo "make demo     scan the micro-contour standard on the virtual rig"
 	@echo "make test     the whole test suite"
 	@echo "make check    style, types, layers"
 	@echo "make bench    the numbers, with this machine's name"
+	@echo "make faults   break everything in turn while a simulated scan runs (10 minutes)"
+	@echo "make soak     the whole stack at 172 Hz for MINUTES=30"
 	@echo "make wheel    build dist/endo3d-*.whl"
 
 $(INSTALLED): pyproject.toml deploy/constraints.txt
@@ -38,6 +40,12 @@ check: $(INSTALLED) build/typings
 
 bench: $(INSTALLED)
 	$(BIN)/python -m bench.run $(ARGS)
+
+faults: $(INSTALLED)
+	$(BIN)/python -m bench.reliability.faults $(ARGS)
+
+soak: $(INSTALLED)
+	$(BIN)/python -m bench.reliability.soak --minutes $(or $(MINUTES),30) $(ARGS)
 
 wheel: $(INSTALLED)
 	@rm -rf build/lib  # a module that is gone would still get into the wheel

@@ -23,6 +23,8 @@ from endo3d_core.calibration import Lens, Rig
 TURN_S = 0.004
 REOPEN_NS = 1_000_000_000
 """How often a camera that is gone is looked for."""
+SILENCE_NS, SILENCE_PERIODS = 1_000_000_000, 10
+"""A camera that gives no image for so long, while the projector runs, is reported."""
 HELD = 2
 """Shots that wait for their mode to be announced."""
 
@@ -55,6 +57,9 @@ class Grabber(Source[GrabberConfig]):
         self.gone = 0
         """How often the camera was lost."""
         self.look_ns = 0
+        self.patience_ns = SILENCE_NS
+        self.image_due_ns: int | None = None
+        """None while the projector does not run."""
         self.lost_before: Mapping[str, int] = {}
         """By cameras that are gone."""
 
@@ -87,6 +92,8 @@ class Grabber(Source[GrabberConfig]):
     def step(self, message: Message) -> Iterator[Message]:
         if isinstance(message, Mode):
             self.labels.add(message)
+            self.patience_ns = max(SILENCE_NS, SILENCE_PERIODS * message.frame_period_ns)
+            self.image_due_ns = message.start_ns + self.patience_ns if message.running else None
             if message.running:
                 self.exposure_us = message.exposure_us
                 if self._camera is not None:
@@ -110,6 +117,8 @@ class Grabber(Source[GrabberConfig]):
         if shot is not None:
             self.lent -= 1
             self.held.append(shot)
+            if self.image_due_ns is not None:
+                self.image_due_ns = self.camera.now_ns() + self.patience_ns
         while self.held and (label := self.labels.of(self.held[0].trigger_ns)) is not None:
             yield from self.labelled(self.held.popleft(), label)
         if len(self.held) > HELD:
@@ -135,6 +144,10 @@ class Grabber(Source[GrabberConfig]):
         self.look_ns = time.monotonic_ns() + REOPEN_NS
 
     def trouble(self) -> str:
+        camera, due_ns = self._camera, self.image_due_ns
+        if camera is not None and due_ns is not None and (late_ns := camera.now_ns() - due_ns) > 0:
+            silent_s = 1e-9 * (late_ns + self.patience_ns)
+            return f"no image for {silent_s:.0f} s though the projector runs; check the trigger's cable, and the lens cap"
         return self.note
 
     def values(self) -> Mapping[str, float]:

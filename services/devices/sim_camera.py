@@ -3,7 +3,7 @@
 The body is a scene's text (``contour texture=noise:0.15``). Options: ``motion`` (``hand seed=7``), ``preset``
 (fast, full, ideal), ``bin`` (pixels per pixel, 2 gives 960x600), ``slow_motion`` (seconds of wall time per
 simulated second: exposures and motion are those of the simulated time), ``seed`` of the noise, ``bench``
-(path).
+(path), ``cable`` (a file that stands for the trigger's cable: without it no image comes).
 """
 
 from __future__ import annotations
@@ -44,23 +44,33 @@ def open_uri(uri: Uri, setting: Setting) -> SimCamera:
     except ValueError as error:
         raise DeviceError(f"device {uri.text!r}: {error}") from error
     slow_motion, seed, bin_px = uri.number("slow_motion", 1.0), uri.number("seed", 0), uri.number("bin", 2)
+    cable = uri.text_of("cable", "")
     uri.finish()
     if not slow_motion > 0.0:
         raise DeviceError(f"device {uri.text!r}: slow_motion must be positive")
     renderer = Renderer(rig, head, scene, PRESETS[preset], bin_px=int(bin_px))
-    return SimCamera(Bench(path), renderer, motion, slow_motion, int(seed), int(bin_px))
+    triggered_by = Path(cable) if cable else None
+    return SimCamera(Bench(path), renderer, motion, slow_motion, int(seed), int(bin_px), triggered_by)
 
 
 class SimCamera:
     """Triggered by the bench's light; as on a real one, a trigger while it is busy makes no frame."""
 
     def __init__(
-        self, bench: Bench, renderer: Renderer, motion: Motion, slow_motion: float, seed: int, bin_px: int
+        self,
+        bench: Bench,
+        renderer: Renderer,
+        motion: Motion,
+        slow_motion: float,
+        seed: int,
+        bin_px: int,
+        cable: Path | None = None,
     ) -> None:
         self._bench, self._renderer, self._motion = bench, renderer, motion
         self.scene, self.slow_motion = renderer.scene.text, slow_motion
         self.corner, self.bin_px = (0, 0), bin_px
         self._seed = seed
+        self._cable = cable
         self._lent: deque[NDArray[Any]] = deque()
         self._shown, self._changes = Shown(), -1
         self._timeline: Timeline | None = None
@@ -92,7 +102,7 @@ class SimCamera:
     def wait(self, timeout_s: float) -> Shot | None:
         deadline_ns = self.now_ns() + int(timeout_s * 1e9)
         self._look()
-        if self._timeline is None:
+        if self._timeline is None or (self._cable is not None and not self._cable.exists()):
             time.sleep(max(0.0, timeout_s))
             return None
         if self._exposing is not None:

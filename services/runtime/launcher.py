@@ -101,6 +101,13 @@ class Launcher:
         for child in reversed(self.children):
             self._spawn(child)
 
+    def restart(self, name: str) -> None:
+        """End one service as asked to, and start it again at the next turn."""
+        child = next(child for child in self.children if child.name == name)
+        self._end(child, STOP_GRACE_S, hurry=lambda: False)
+        child.state, child.restart_at_s = State.WAITING, time.monotonic()
+        self.sink(child.name, "restarted")
+
     def turn(self, timeout_s: float = 0.2) -> None:
         """Pass on what the services say, notice deaths, restart what is due; waits at most ``timeout_s``."""
         due = [child.restart_at_s for child in self.children if child.state is State.WAITING]
@@ -143,15 +150,18 @@ class Launcher:
                 child.state = State.STOPPED
             if child.state is not State.RUNNING:
                 continue
-            child.state = State.STOPPED
-            self._signal(child, signal.SIGTERM)
-            deadline_s = time.monotonic() + grace_s
-            while child.process is not None:
-                if hurry() or time.monotonic() > deadline_s:
-                    self.sink(child.name, "does not stop; killed")
-                    self._signal(child, signal.SIGKILL)
-                    deadline_s = time.monotonic() + grace_s
-                self.turn(0.1)
+            self._end(child, grace_s, hurry)
+
+    def _end(self, child: Child, grace_s: float, hurry: Callable[[], bool]) -> None:
+        child.state = State.STOPPED
+        self._signal(child, signal.SIGTERM)
+        deadline_s = time.monotonic() + grace_s
+        while child.process is not None:
+            if hurry() or time.monotonic() > deadline_s:
+                self.sink(child.name, "does not stop; killed")
+                self._signal(child, signal.SIGKILL)
+                deadline_s = time.monotonic() + grace_s
+            self.turn(0.1)
 
     def close(self) -> None:
         """Kill what still runs; for the way out after a failure of the caller."""

@@ -25,11 +25,12 @@ def plugged_in(uri: Uri, setting: Setting, window: tuple[int, int], offset: tupl
     """How to find an emulated controller on an emulated USB port. Raises ``DeviceError``."""
     path = Path(uri.text_of("bench", str(default_path(setting.rig))))
     name = f"DLP{uri.text_of('dmd', '6500')}"
+    cable = uri.text_of("cable", "")
     kinds = {of: kind for kind, (of, *_) in DMDS.items()}
     if name not in kinds:
         raise DeviceError(f"device {uri.text!r}: there is an emulated {' and a '.join(kinds)}, no {name}")
     light = Light(Bench(path), window, offset)
-    port = UsbPort(Dlpc900(kinds[name], light.show, light.dark))
+    port = UsbPort(Dlpc900(kinds[name], light.show, light.dark), Path(cable) if cable else None)
     return lambda: usb.core.find(idVendor=VENDOR, idProduct=PRODUCT, backend=port)
 
 

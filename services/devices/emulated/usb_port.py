@@ -1,7 +1,7 @@
 """A USB port for pyusb with an emulated DLPC900 plugged in: ``usb.core.find(..., backend=port)``.
 
 The port can fail on command, as cables and hosts do: time out, stall, unplug, cut a reply short, or answer
-with a stale sequence number.
+with a stale sequence number. Where a file stands for the cable, somebody in another process can pull it.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ import errno
 from array import array
 from collections import deque
 from collections.abc import Iterator
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, Literal
 
@@ -27,8 +28,10 @@ Fault = Literal["timeout", "stall", "unplug", "short read", "wrong sequence"]
 class UsbPort(usb.backend.IBackend):  # type: ignore[misc]
     """A pyusb backend with one HID interface, 64-byte interrupt endpoints, and one device or none."""
 
-    def __init__(self, device: Dlpc900 | None = None) -> None:
+    def __init__(self, device: Dlpc900 | None = None, cable: Path | None = None) -> None:
+        """``cable``: a file; the device is plugged in while it exists."""
         self.device = device or Dlpc900()
+        self._cable = cable
         self.plugged = True
         self.kernel_driver = True
         """usbhid holds the interface, as on a real Linux host, until it is detached."""
@@ -54,6 +57,7 @@ class UsbPort(usb.backend.IBackend):  # type: ignore[misc]
         self.kernel_driver = True
 
     def enumerate_devices(self) -> Iterator[object]:
+        self._follow_cable()
         return iter((self,) if self.plugged else ())
 
     def get_parent(self, dev: object) -> None:
@@ -153,7 +157,16 @@ class UsbPort(usb.backend.IBackend):  # type: ignore[misc]
         buff[: len(report)] = array("B", report)
         return len(report)
 
+    def _follow_cable(self) -> None:
+        if self._cable is None or self._cable.exists() == self.plugged:
+            return
+        if self.plugged:
+            self.unplug()
+        else:
+            self.plug_in()
+
     def _needs_cable(self) -> None:
+        self._follow_cable()
         if not self.plugged:
             raise usb.core.USBError("No such device (it may have been disconnected)", errno=errno.ENODEV)
 
