@@ -105,7 +105,8 @@ def every_fault(room: Room, cables: Path) -> list[Fault]:
     for name in SERVICES:
         faults.append(Fault(f"restart {name}", partial(_restart, service=name), new_world=name in WORLDLY))
     for fault, device in (("unplugged projector", PROJECTOR), ("stalled camera", CAMERA)):
-        faults.append(Fault(fault, partial(_pull, cable=cables / device), partial(_plug, cable=cables / device), STALLED_S))
+        pull, plug = (partial(do, cable=cables / device) for do in (_pull, _plug))
+        faults.append(Fault(fault, pull, plug, STALLED_S))
     if not room.reason:
         faults.append(Fault("full disk", partial(_fill_disk, room=room), partial(_free_disk, room=room), FULL_S))
         faults.append(
@@ -151,10 +152,7 @@ def suffer(scan: Scan, fault: Fault) -> Outcome:
     """One fault, from a scan that goes well to one that goes well again."""
     outcome = Outcome(fault.name)
     try:
-        scan.until(_well_from_now(scan), WORLDLY = ("odometry",)
-"""Whose process holds the map: a new one begins a new world."""
-CAMERA, PROJECTOR = "camera", "projector"
-STEADY_LIMIT_S, "the scan before the fault")
+        scan.until(_well_from_now(scan), STEADY_LIMIT_S, "the scan before the fault")
         scan.listen()
         lost_before = scan.witness.lost()
         fault.inject(scan)
