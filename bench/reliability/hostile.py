@@ -13,6 +13,7 @@ import threading
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import zenoh
@@ -45,7 +46,7 @@ class Attacker:
         self._session = open_session(meeting_ports(rig), shared_memory=False)
         self._genuine: dict[str, bytes] = {}
         self._readers = [
-            self._session.declare_subscriber(topic.key(rig), lambda sample, name=topic.name: self._hear(name, sample))
+            self._session.declare_subscriber(topic.key(rig), partial(self._hear, topic.name))
             for topic in topics.TOPICS
         ]
         self._lock = threading.Lock()
