@@ -66,6 +66,8 @@ class Outcome:
     lost: dict[str, int] = field(default_factory=dict)
     wrong_poses: int = 0
     worst_um: float = 0.0
+    wrong_states: dict[str, int] = field(default_factory=dict)
+    """What the wrong ones call themselves."""
     hung: str = ""
 
     @property
@@ -88,6 +90,7 @@ def main() -> int:
         outcomes, log = campaign(room, cables, faults)
         whole_log = not asked.faults or "corrupted log".startswith(tuple(asked.faults))
         verdict = damage(log, Path(folder), DAMAGED_LOGS) if whole_log else None
+        room.close()
     show(outcomes, verdict, room.reason)
     if asked.page:
         about_logs = asdict(verdict) if verdict is not None else None
@@ -166,7 +169,7 @@ def suffer(scan: Scan, fault: Fault) -> Outcome:
     except Hung as hung:
         outcome.hung = str(hung)
     seen = scan.witness.take()
-    outcome.tracking = dict(seen.tracking)
+    outcome.tracking, outcome.wrong_states = dict(seen.tracking), dict(seen.wrong_states)
     outcome.wrong_poses, outcome.worst_um = seen.wrong, 1e3 * seen.worst_mm
     launcher_said = next((line for line in scan.said if "killed by" in line or "restarted" in line), "")
     note = next((f"{name}: {note}" for name, note in seen.notes.items()), "")
@@ -249,7 +252,9 @@ def _commands(scan: Scan) -> None:
 def _in_words(outcome: Outcome) -> str:
     if outcome.hung:
         return f"[red]HUNG[/red] {outcome.hung}"
-    wrong = f", [red]{outcome.wrong_poses} wrong poses[/red]" if outcome.wrong_poses else ""
+    wrong = ""
+    if outcome.wrong_poses:
+        wrong = f", [red]{outcome.wrong_poses} wrong poses[/red] up to {outcome.worst_um:.0f} um: {outcome.wrong_states}"
     return f"recovered after {outcome.recovery_s:.1f} s{wrong}"
 
 

@@ -26,6 +26,11 @@ class Room:
             _mount(disk, disk_mb)
             _mount(SHM, shm_mb)
 
+    def close(self) -> None:
+        """Leave: whatever lies on the folder's file system is gone."""
+        if not self.reason:
+            subprocess.run(["umount", "--lazy", str(self.disk), str(SHM)], check=True)
+
     def fill(self, folder: Path, left_mb: int) -> None:
         """Leave ``left_mb`` on the file system of ``folder``."""
         stat = os.statvfs(folder)

@@ -30,6 +30,8 @@ class Record:
     wrong: int = 0
     """Poses that say they are tracked and are further than ``WRONG_MM`` from the truth."""
     worst_mm: float = 0.0
+    wrong_states: Counter[str] = field(default_factory=Counter)
+    """What they call themselves."""
     cloud_latency_ms: list[float] = field(default_factory=list)
     pose_latency_ms: list[float] = field(default_factory=list)
     tracking: Counter[str] = field(default_factory=Counter)
@@ -123,7 +125,9 @@ class Witness:
             self.newest_pose_ns = message.stamp_ns
             error_mm = self._error_mm(message)
             record.worst_mm = max(record.worst_mm, error_mm)
-            record.wrong += error_mm > WRONG_MM
+            if error_mm > WRONG_MM:
+                record.wrong += 1
+                record.wrong_states[f"{message.state}, submap {message.submap}"] += 1
 
     def _error_mm(self, pose: Pose) -> float:
         """Distance of the tip from where it truly is; 0 for the first pose of a submap, and without truth."""
