@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import os
 import threading
 from collections import Counter
@@ -80,7 +81,7 @@ class Recorder(Tap[RecorderConfig]):
     def __init__(self, config: RecorderConfig) -> None:
         super().__init__(config)
         self._kinds = {topic.name: Kind(*codec.schema(topic)) for topic in self.reads}
-        self._period_ns = {topic.name: _period_ns(config.log_hz.get(topic.name, topic.log_hz)) for topic in self.reads}
+        self._log_hz = {topic: config.log_hz.get(topic.name, topic.log_hz) for topic in self.reads}
         self._due_ns: dict[str, int] = {}
         self._latched: dict[str, Entry] = {}
         self._lost: Counter[str] = Counter()
@@ -93,6 +94,11 @@ class Recorder(Tap[RecorderConfig]):
         self._spool: Spool | None = None
         self._repairing: threading.Thread | None = None
         self._start_at_next = config.autostart
+
+    def newest_hz(self, topic: Topic) -> float | None:
+        """Of a large topic that is thinned out, what is not archived is not even looked at."""
+        hz = self._log_hz[topic]
+        return hz if hz == 0 or (topic.bulk and math.isfinite(hz)) else None
 
     def open(self) -> None:
         """Repair what a crash left torn in the directory, in the background.
@@ -223,9 +229,12 @@ class Recorder(Tap[RecorderConfig]):
 
     def _due(self, entry: Entry, topic: Topic) -> bool:
         """Whether the topic's archive rate has room for this message."""
-        period_ns = self._period_ns[topic.name]
+        hz = self._log_hz[topic]
+        if hz == 0:
+            return False
+        period_ns = round(1e9 / hz)
         due_ns = self._due_ns.get(entry.channel, entry.log_ns)
-        if period_ns is None or entry.log_ns < due_ns:
+        if entry.log_ns < due_ns:
             return False
         # In step with the rate while messages come, so that jitter costs none; from now on after a pause.
         late = entry.log_ns >= due_ns + period_ns
@@ -265,11 +274,6 @@ class Recorder(Tap[RecorderConfig]):
             spool.close()
             self._lost.update(_causes(spool))
             _log.info("recorded %s: %d messages", spool.recording.path, spool.recording.messages)
-
-
-def _period_ns(rate_hz: float) -> int | None:
-    """Time between archived messages; None is never."""
-    return round(1e9 / rate_hz) if rate_hz > 0 else None
 
 
 def _copy(payload: Buffer, memory: memoryview) -> None:

@@ -11,6 +11,7 @@ from pydantic import Field
 
 from endo3d.schemas import topics
 from endo3d.schemas.messages import Message
+from endo3d.schemas.topics import Topic
 from endo3d.services.runtime.service import Config, Service
 from endo3d.services.views.viewer_process import ViewerProcess, has_display
 
@@ -55,7 +56,6 @@ class Viewer(Service[ViewerConfig]):
         topics.LOG,
     )
     optional = reads
-    newest = (topics.FRAME, topics.CLOUD, topics.DEPTH)
     nice = 10
 
     def __init__(self, config: ViewerConfig) -> None:
@@ -91,6 +91,15 @@ class Viewer(Service[ViewerConfig]):
             for sink in self.sinks:
                 sink.log(message.stamp_ns, entry)
         return iter(())
+
+    def newest_hz(self, topic: Topic) -> float | None:
+        """What is not shown is not even decoded; of the map every change counts."""
+        match topic:
+            case topics.FRAME | topics.POSE:
+                return self.config.rate_hz
+            case topics.CLOUD | topics.DEPTH:
+                return min(self.config.rate_hz, self.config.cloud_hz)
+        return None
 
     def losses(self) -> Mapping[str, int]:
         return {"view:not taken": self.viewer.lost} if self.viewer and self.viewer.lost else {}

@@ -62,7 +62,7 @@ class Bus:
         self._readers: list[Reader] = []
         self._queryables: list[zenoh.Queryable[Any]] = []
         self._declared: list[object] = []
-        self._tokens: list[zenoh.LivelinessToken] = []
+        self._tokens: dict[str, zenoh.LivelinessToken] = {}
         self._named: set[str] = set()
         self._lock = threading.Lock()
 
@@ -117,13 +117,13 @@ class Bus:
 
     def stop_reading(self) -> None:
         """No more messages and commands; when it returns, all handlers have returned."""
-        for token in self._tokens:
-            token.undeclare()
+        for service in tuple(self._tokens):
+            self.undeclare_alive(service)
         for queryable in self._queryables:
             queryable.undeclare()
         for reader in self._readers:
             reader.close()
-        self._tokens, self._queryables, self._readers = [], [], []
+        self._queryables, self._readers = [], []
 
     def close(self) -> None:
         """Stop reading, then leave. Arrays that were loaned or received are void from now on."""
@@ -163,11 +163,13 @@ class Bus:
         self._writer(topic, topic.key(self.rig, source)).put(payload)
         self.tally.publish(topic.name)
 
-    def subscribe(self, topic: Topic, handler: Callable[[Message], None], *, newest: bool = False) -> None:
+    def subscribe(
+        self, topic: Topic, handler: Callable[[Message], None], *, newest_hz: float | None = None
+    ) -> None:
         """Call ``handler`` with the messages of ``topic``, in a thread of its own.
 
-        ``newest``: a slow handler skips to the newest message. Otherwise ``topic.depth`` of them may wait,
-        and what is missed beyond that is counted. Malformed messages are counted and dropped.
+        ``newest_hz``: only the newest message each time, and at most so often. Otherwise ``topic.depth`` of them
+        may wait, and what is missed beyond that is counted. Malformed messages are counted and dropped.
         """
 
         def deliver(sample: Sample) -> None:
@@ -175,15 +177,17 @@ class Bus:
             if message is not None:
                 handler(message)
 
-        self.subscribe_encoded(topic, deliver, newest=newest)
+        self.subscribe_encoded(topic, deliver, newest_hz=newest_hz)
 
-    def subscribe_encoded(self, topic: Topic, handler: Callable[[Sample], None], *, newest: bool = False) -> None:
+    def subscribe_encoded(
+        self, topic: Topic, handler: Callable[[Sample], None], *, newest_hz: float | None = None
+    ) -> None:
         """The same with samples as they travelled."""
         if topic.bulk and self._view is not None:
             self._declared.append(
                 mapping.map_offered(self._session, mapping.key(self.rig, topic), lambda: self._can_not_map(topic))
             )
-        reader = Reader(self._session, topic.key(self.rig), topic, handler, self._view, self.tally, newest=newest)
+        reader = Reader(self._session, topic.key(self.rig), topic, handler, self._view, self.tally, newest_hz)
         self._readers.append(reader)
         reader.start()
 
@@ -196,9 +200,12 @@ class Bus:
 
     # ---------------------------------------------------------------- commands
 
-    def serve(self, handler: Command) -> None:
-        """Answer commands to this process's service, one at a time, in a thread of its own."""
-        key = topics.control_key(self.rig, self.name, "*")
+    def serve(self, handler: Command, service: str = "") -> None:
+        """Answer commands to this process's service, one at a time, in a thread of its own.
+
+        service: another one, that is reached through this process.
+        """
+        key = topics.control_key(self.rig, service or self.name, "*")
         queryable = self._session.declare_queryable(key, FifoChannel(16))
         self._queryables.append(queryable)
         threading.Thread(target=_answer_all, args=(queryable, handler), name="serve", daemon=True).start()
@@ -227,10 +234,16 @@ class Bus:
 
     # ---------------------------------------------------------------- who is there
 
-    def declare_alive(self) -> None:
-        """From now on others see this process's service."""
-        key = topics.alive_key(self.rig, self.name)
-        self._tokens.append(self._session.liveliness().declare_token(key))
+    def declare_alive(self, service: str = "") -> None:
+        """From now on others see this process's service, or another one that is reached through this process."""
+        name = service or self.name
+        if name not in self._tokens:
+            self._tokens[name] = self._session.liveliness().declare_token(topics.alive_key(self.rig, name))
+
+    def undeclare_alive(self, service: str) -> None:
+        """That other one is gone."""
+        if token := self._tokens.pop(service, None):
+            token.undeclare()
 
     def alive(self) -> set[str]:
         """The services that are there now."""

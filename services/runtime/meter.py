@@ -18,8 +18,9 @@ _WINDOW: Final = 2_048
 class Meter:
     """Counts steps and their latencies; any thread may count."""
 
-    def __init__(self) -> None:
-        self.host = socket.gethostname()
+    def __init__(self, host: str = "") -> None:
+        """host: its name in the stack file; by default the machine's own."""
+        self.host = host or socket.gethostname()
         self.pid = os.getpid()
         self._process = psutil.Process()
         self._process.cpu_percent()

@@ -40,27 +40,34 @@ class Reader(threading.Thread):
         deliver: Callable[[Sample], None],
         view: View | None,
         tally: Tally,
-        *,
-        newest: bool,
+        newest_hz: float | None,
     ) -> None:
-        """``newest``: the ring holds one sample, and what it drops is skipped on purpose, not lost."""
+        """``newest_hz``: the ring holds one sample, and what it drops is skipped on purpose, not lost; between two
+        samples this thread sleeps, so that those that nobody looks at cost nothing here.
+        """
         super().__init__(name=f"read {topic.name}", daemon=True)
         self._topic = topic
         self._deliver = deliver
         self._view = view
         self._tally = tally
-        self._newest = newest
+        self._newest = newest_hz is not None
+        self._period_s = 1.0 / newest_hz if newest_hz is not None else 0.0
+        self._due_s = 0.0
+        self._closing = threading.Event()
         self._expected: dict[tuple[zenoh.ZenohId, int], int] = {}
         self._chunks: weakref.WeakSet[Chunk] = weakref.WeakSet()
-        self._subscriber = _subscribe(session, key, topic, 1 if newest else topic.depth)
+        self._subscriber = _subscribe(session, key, topic, 1 if self._newest else topic.depth)
 
     def run(self) -> None:
         with contextlib.suppress(zenoh.ZError):  # the ring is closed
             while True:
                 self._take(self._subscriber.handler.recv())  # in no variable: it would hold its memory
+                if self._period_s and self._closing.wait(max(0.0, self._due_s - time.monotonic())):
+                    break
 
     def close(self) -> None:
         """Ends the thread after the sample it works on."""
+        self._closing.set()
         self._subscriber.undeclare()
         if threading.current_thread() is not self:
             self.join()
@@ -70,6 +77,7 @@ class Reader(threading.Thread):
         return all(chunk.is_valid() for chunk in tuple(self._chunks))
 
     def _take(self, sample: zenoh.Sample) -> None:
+        self._due_s = time.monotonic() + self._period_s
         try:
             self._deliver_content(sample)
         except Exception:

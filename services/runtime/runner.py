@@ -18,7 +18,7 @@ from endo3d.services.runtime import log as logs
 from endo3d.services.runtime.bus import Bus
 from endo3d.services.runtime.errors import UserError
 from endo3d.services.runtime.meter import Meter
-from endo3d.services.runtime.service import Exhausted, Sample, Service, Source, Tap
+from endo3d.services.runtime.service import Exhausted, Gateway, Sample, Service, Source, Tap
 from endo3d.services.runtime.turn import Turn
 
 log = logging.getLogger(__name__)
@@ -32,16 +32,19 @@ _SWITCH_S: Final = 5e-4
 """A thread that computes in Python hands over after this long: samples wait less."""
 
 
-def run(service: Service[Any], *, rig: str, name: str, port: int | None = None, shm_mb: int = 512) -> int:
+def run(
+    service: Service[Any], *, rig: str, name: str, port: int | None = None, shm_mb: int = 512, host: str = ""
+) -> int:
     """Run ``service`` until SIGTERM, SIGINT, the end of its source, or repeated failure; the exit code.
 
+    host: this host's name in the stack file, if it has one.
     To be called in the main thread. Raises ``UserError`` when the bus or the service can't be opened.
     """
     logs.to_stderr()
     sys.setswitchinterval(_SWITCH_S)
     os.setpriority(os.PRIO_PROCESS, 0, max(service.nice, os.getpriority(os.PRIO_PROCESS, 0)))
     with Bus.open(rig, name=name, port=port, shm_mb=shm_mb) as bus:
-        runner = Runner(service, bus)
+        runner = Runner(service, bus, host)
 
         def stop(number: int, frame: FrameType | None) -> None:
             runner.stop()
@@ -57,11 +60,11 @@ def run(service: Service[Any], *, rig: str, name: str, port: int | None = None, 
 class Runner:
     """One service on a bus. Its step, poll and command never run at the same time."""
 
-    def __init__(self, service: Service[Any], bus: Bus) -> None:
+    def __init__(self, service: Service[Any], bus: Bus, host: str = "") -> None:
         self._service = service
         self._bus = bus
         self._turn = Turn()
-        self._meter = Meter()
+        self._meter = Meter(host)
         self._stopped = threading.Event()
         self._closed = threading.Event()
         self._state = ServiceState.STARTING
@@ -106,11 +109,15 @@ class Runner:
     def _connect(self) -> None:
         service, bus = self._service, self._bus
         for topic in service.reads:
-            newest = topic in service.newest
+            newest_hz = service.newest_hz(topic)
+            if newest_hz == 0:
+                continue
             if isinstance(service, Tap):
-                bus.subscribe_encoded(topic, self._take, newest=newest)
+                bus.subscribe_encoded(topic, self._take, newest_hz=newest_hz)
             else:
-                bus.subscribe(topic, self._step, newest=newest)
+                bus.subscribe(topic, self._step, newest_hz=newest_hz)
+        if isinstance(service, Gateway):
+            service.connect(bus)
         bus.serve(self._command)
         bus.declare_alive()
         log.info("ready")

@@ -6,9 +6,10 @@ in replay and in tests, so a replay is bit-exact.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, Generic, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
@@ -16,6 +17,9 @@ from pydantic import BaseModel, ConfigDict
 
 from endo3d.schemas.messages import Message
 from endo3d.schemas.topics import Topic
+
+if TYPE_CHECKING:
+    from endo3d.services.runtime.bus import Bus
 
 
 class Config(BaseModel):
@@ -86,6 +90,10 @@ class Service(Generic[C]):
         self.config = config
         self.loan: Loan = plain_loan
 
+    def newest_hz(self, topic: Topic) -> float | None:
+        """How many samples a second are looked at, the newest each time; None: every sample counts; 0: none."""
+        return math.inf if topic in self.newest else None
+
     def open(self) -> None:
         """Take what has to be taken (a device, a file). Raises with what to do."""
 
@@ -138,3 +146,10 @@ class Tap(Service[C]):
     def take(self, sample: Sample) -> Iterator[Message]:
         """One sample in; what has to outlive the call is copied, then ``sample.valid()`` is asked."""
         return iter(())
+
+
+class Gateway(Service[C]):
+    """A service at the edge of the bus: it carries what others say, so it gets the bus itself."""
+
+    def connect(self, bus: Bus) -> None:
+        """Called once, when the service is open; from then on its threads may use the bus until ``close``."""
