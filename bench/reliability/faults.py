@@ -252,10 +252,10 @@ def _commands(scan: Scan) -> None:
 def _in_words(outcome: Outcome) -> str:
     if outcome.hung:
         return f"[red]HUNG[/red] {outcome.hung}"
-    wrong = ""
+    words = f"recovered after {outcome.recovery_s:.1f} s"
     if outcome.wrong_poses:
-        wrong = f", [red]{outcome.wrong_poses} wrong poses[/red] up to {outcome.worst_um:.0f} um: {outcome.wrong_states}"
-    return f"recovered after {outcome.recovery_s:.1f} s{wrong}"
+        words += f", [red]{outcome.wrong_poses} wrong poses[/red], up to {outcome.worst_um:.0f} um: {outcome.wrong_states}"
+    return words
 
 
 def show(outcomes: Sequence[Outcome], verdict: Verdict | None, reason: str) -> None:
