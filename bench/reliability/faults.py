@@ -254,7 +254,8 @@ def _in_words(outcome: Outcome) -> str:
         return f"[red]HUNG[/red] {outcome.hung}"
     words = f"recovered after {outcome.recovery_s:.1f} s"
     if outcome.wrong_poses:
-        words += f", [red]{outcome.wrong_poses} wrong poses[/red], up to {outcome.worst_um:.0f} um: {outcome.wrong_states}"
+        words += f", [red]{outcome.wrong_poses} wrong poses[/red]: up to {outcome.worst_um:.0f} um"
+        words += f", {', '.join(outcome.wrong_states)}"
     return words
 
 
