@@ -37,6 +37,7 @@ PANELS: dict[str, dict[str, str]] = {
         "check": "Check a stack file and print its dataflow.",
         "run": "Run one service of a stack in this process.",
         "devices": "List cameras and projectors, and try them.",
+        "keys": "Certificates for the hosts of a rig.",
         "import": "Turn images of another instrument into a log.",
     },
 }

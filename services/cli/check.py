@@ -55,18 +55,37 @@ def _tree(stack: Stack, wiring: Graph) -> Tree:
     from rich.tree import Tree
 
     tree = Tree(f"[bold]endo3d/{wiring.rig}[/]  [dim]{stack.label}, head {stack.rig.head}[/]")
+    hosts = stack.placement.services
     for entry in wiring.entries:
         other = f" [dim](module {entry.module})[/]" if entry.module != entry.name else ""
-        branch = tree.add(f"[bold cyan]{entry.name}[/]{other}")
+        where = f" [yellow]on {', '.join(hosts[entry.name])}[/]" if hosts else ""
+        branch = tree.add(f"[bold cyan]{entry.name}[/]{other}{where}")
         for topic in entry.kind.writes:
             how = f"{topic.message.__name__}, up to {topic.rate_hz:g} Hz"
             how += ", shared memory" if topic.bulk else ""
             readers = wiring.readers(entry.name, topic)
             branch.add(f"[green]{topic.name}[/] [dim]({how})[/] → {', '.join(readers) or '[dim]nobody[/]'}")
-        if not entry.kind.writes:
+        if not entry.kind.writes and entry.kind.reads:
             read = sorted({edge.topic.name for edge in wiring.edges if edge.reader == entry.name})
             branch.add(f"[dim]reads {', '.join(read)}[/]")
+    if hosts:
+        _add_hosts(tree, stack, wiring)
     return tree
+
+
+def _add_hosts(tree: Tree, stack: Stack, wiring: Graph) -> None:
+    """The hosts, and what crosses between them."""
+    from endo3d.services.runtime.hosts import lanes
+
+    for name, host in stack.placement.hosts.items():
+        router = f", router at {stack.placement.endpoint}" if name == stack.placement.router else ""
+        thin = ", reduced streams" if host.preview else ""
+        branch = tree.add(f"[bold yellow]{name}[/] [dim]({host.role}{router}{thin})[/]")
+        for lane in lanes(stack.placement, wiring):
+            crossing = [topic.name for topic in lane.topics if not topic.per_service]
+            if lane.sender == name and crossing:
+                shared = " [dim](its share of the frames)[/]" if lane.shared else ""
+                branch.add(f"[green]{', '.join(crossing)}[/]{shared} → {lane.receiver}")
 
 
 def _show_keys(stack: Stack, service: str) -> None:

@@ -38,4 +38,8 @@ RigOption = Annotated[
         "--rig", envvar="ENDO3D_RIG", help="The rig's name as in its stack file, or the file (.toml)."
     ),
 ]
+HostOption = Annotated[
+    str,
+    typer.Option("--host", envvar="ENDO3D_HOST", help="Which of the stack's hosts this one is: [hosts.NAME]."),
+]
 JsonOption = Annotated[bool, typer.Option("--json", help="Machine-readable output.")]

@@ -6,13 +6,14 @@ from typing import Annotated
 
 import typer
 
-from endo3d.services.cli.options import SetOption, StackOption
+from endo3d.services.cli.options import HostOption, SetOption, StackOption
 
 
 def run(
     service: Annotated[str, typer.Argument(help="The service's table in the stack file.")],
     stack: StackOption = "demo",
     overrides: SetOption = None,
+    host: HostOption = "",
 ) -> None:
     """Run one service of a stack in this process.
 
@@ -30,10 +31,11 @@ def run(
     from endo3d.services.runtime import runner, stack_file
     from endo3d.services.runtime.errors import UserError
 
-    described = stack_file.load(stack, overrides or ())
+    described = stack_file.load(stack, overrides or ()).on(host)
     built = described.entry(service).build()
     try:
-        code = runner.run(built, rig=described.rig.name, name=service, port=described.rig.port)
+        name = described.share().get(service, service)
+        code = runner.run(built, rig=described.rig.name, name=name, port=described.rig.port, host=host)
     except UserError:
         raise
     except Exception:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from endo3d.services.cli.options import SetOption, StackArgument
+from endo3d.services.cli.options import HostOption, SetOption, StackArgument
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -18,26 +18,32 @@ COLOURS = ("cyan", "green", "magenta", "yellow", "blue", "bright_red", "bright_c
 def up(
     stack: StackArgument,
     overrides: SetOption = None,
+    host: HostOption = "",
     seconds: Annotated[float, typer.Option("--seconds", help="Stop after that long; 0 runs on.")] = 0.0,
 ) -> None:
     """Start every service of a stack file, and keep them running.
 
     A crashed service is restarted, first after 0.2 s. Ctrl-C stops all, sources first, so that the archive is
-    closed; a second Ctrl-C kills what has not stopped yet.
+    closed; a second Ctrl-C kills what has not stopped yet. Of a stack with several hosts, the services of this one.
 
-    Examples: endo3d up demo; endo3d up my.toml --set recorder.directory=/data
+    Examples: endo3d up demo; endo3d up my.toml --set recorder.directory=/data; endo3d up two.toml --host rig
     """
     from endo3d.services.runtime import graph, stack_file
     from endo3d.services.runtime.errors import UserError
     from endo3d.services.runtime.launcher import Launcher, children_of
+    from endo3d.services.runtime.notify import Notifier
 
-    described = stack_file.load(stack, overrides or ())
+    described = stack_file.load(stack, overrides or ()).on(host)
     graph.of(described)
-    asked = Asked()
-    with Launcher(children_of(described, overrides or ()), log_printer(list(described.tables))) as launcher:
+    asked, systemd = Asked(), Notifier()
+    names = list(described.share().values())
+    with Launcher(children_of(described, overrides or ()), log_printer(names)) as launcher:
         launcher.start()
+        systemd.ready(f"started {', '.join(names)}")
         while not (launcher.done or asked.times or (seconds and asked.after(seconds))):
             launcher.turn()
+            systemd.alive()
+        systemd.stopping()
         launcher.stop(hurry=lambda: asked.times > 1)
     if launcher.user_error:
         raise UserError(launcher.user_error)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from endo3d.schemas.topics import Topic
+from endo3d.services.runtime import hosts
 from endo3d.services.runtime.errors import UserError
 from endo3d.services.runtime.stack_file import Entry, Stack
 
@@ -70,8 +71,8 @@ class Graph:
 def of(stack: Stack) -> Graph:
     """The wiring of a stack.
 
-    Raises ``UserError`` for two writers of a topic and for a read that nobody writes. What the runner
-    writes for every service (status, log) is left out.
+    Raises ``UserError`` for two writers of a topic, a read that nobody writes, and hosts that can't work so.
+    What the runner writes for every service (status, log) is left out.
     """
     entries = stack.entries
     writers: dict[str, str] = {}
@@ -95,4 +96,7 @@ def of(stack: Stack) -> Graph:
                     f"{stack.label}: {entry.name} reads {topic.name!r}, which nobody in this stack writes;"
                     " add a table for a service that does"
                 )
-    return Graph(stack.rig.name, entries, tuple(edges))
+    wiring = Graph(stack.rig.name, entries, tuple(edges))
+    if stack.placement.hosts:
+        hosts.check(stack.placement, wiring)
+    return wiring

@@ -71,12 +71,17 @@ class Child:
 
 
 def children_of(stack: Stack, overrides: Sequence[str] = ()) -> list[Child]:
-    """A child per service of a stack, in flow order; each validates its own table again."""
+    """A child per service of a stack that runs on this host, in flow order; each validates its own table again."""
     assert stack.path is not None
     options = ["--stack", str(stack.path), *(part for override in overrides for part in ("--set", override))]
+    if stack.host:
+        options += ["--host", stack.host]
     command = [sys.executable, "-m", "endo3d.services.cli.app", "run"]
+    share = stack.share()
     return [
-        Child(entry.name, [*command, entry.name, *options], entry.is_source, entry.kind.nice) for entry in stack.entries
+        Child(share[entry.name], [*command, entry.name, *options], entry.is_source, entry.kind.nice)
+        for entry in stack.entries
+        if entry.name in share
     ]
 
 

@@ -10,6 +10,8 @@
     [left]                     # a second instance, or a module of your own ("package.module")
     module = "decoder"
 
+Several hosts: see ``hosts.py``.
+
 Nothing is imported until an entry is asked for: a child process loads only the service that it runs.
 """
 
@@ -25,18 +27,22 @@ import tomllib
 import types
 import typing
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from endo3d.services.runtime.errors import UserError
+from endo3d.services.runtime.hosts import HOST_NAME, RELAY, ROUTER, HostTable, Placement, placement_of
+from endo3d.services.runtime.identity import keys_folder
 from endo3d.services.runtime.service import Config, Service, Source
 
-RESERVED = frozenset({"module"})
+M = TypeVar("M", bound=BaseModel)
+
+RESERVED = frozenset({"module", "host"})
 """Keys of a service's table that are the loader's own, not the service's."""
 
 
@@ -51,6 +57,8 @@ class RigTable(BaseModel):
     """A stock head's name, or a file with the calibration, relative to the stack file."""
     port: int | None = Field(None, ge=1024, le=65535)
     """Where the services of this host meet, on the loopback; None derives it from the name."""
+    keys: str = ""
+    """Folder of the certificates for other hosts; by default ``$ENDO3D_KEYS``, or ~/.config/endo3d/keys."""
 
 
 @dataclass(frozen=True)
@@ -87,6 +95,10 @@ class Stack:
     rig: RigTable
     tables: Mapping[str, Mapping[str, Any]]
     """The services' tables, in flow order."""
+    placement: Placement
+    """Which of them runs where."""
+    host: str = ""
+    """The host that this process is on, of a stack with several."""
 
     @property
     def label(self) -> str:
@@ -96,6 +108,20 @@ class Stack:
     def head(self) -> Path:
         """The file with the calibration."""
         return _stock_or_file("head", self.rig.head, "heads", ".yaml", self.base)
+
+    def on(self, host: str) -> Stack:
+        """The same stack, seen from one of its hosts. Raises ``UserError`` for a host that it hasn't."""
+        known = self.placement.hosts
+        if not known and host:
+            raise UserError(f"{self.label} has no hosts; leave --host out, or add [hosts.{host}]")
+        if known and host not in known:
+            which = f"no host {host!r}" if host else "several hosts: say which one this is, --host NAME"
+            raise UserError(f"{self.label} has {which}; {_nearest(host, known)}")
+        return replace(self, host=host)
+
+    def share(self) -> dict[str, str]:
+        """Tables whose services run on this host -> the names by which they go."""
+        return self.placement.on(self.host) if self.host else {table: table for table in self.tables}
 
     @cached_property
     def entries(self) -> tuple[Entry, ...]:
@@ -115,7 +141,9 @@ class Stack:
         return _service_class(self.tables[name].get("module", name), self._where(name, "module"))
 
     def _config(self, name: str, model: type[Config], given: dict[str, Any]) -> Config:
-        shared = {"rig": self.rig.name, "stack": str(self.path or ""), "stack_toml": self.toml}
+        shared = {"rig": self.rig.name, "stack": str(self.path or ""), "stack_toml": self.toml, "host": self.host}
+        if "keys" in model.model_fields:
+            shared["keys"] = str(keys_folder(self.rig.keys, self.base))
         if "head" in model.model_fields:
             shared["head"] = str(self.head)
         known = {key: value for key, value in shared.items() if key in model.model_fields}
@@ -128,6 +156,13 @@ class Stack:
             return model.model_validate(known | given | paths)
         except ValidationError as error:
             raise UserError(self._explain(name, model, error)) from None
+
+    def _checked(self, table: str, model: type[M], given: object) -> M:
+        """A table that is no service's."""
+        try:
+            return model.model_validate(given)
+        except ValidationError as error:
+            raise UserError(self._explain(table, model, error)) from None
 
     def _explain(self, table: str, model: type[BaseModel], error: ValidationError) -> str:
         """The first fault in one line: where, what, and the nearest right key."""
@@ -178,12 +213,18 @@ def loads(text: str, overrides: Sequence[str] = (), *, path: Path | None = None,
         _override(tables, override)
     if overrides:
         text = to_toml(tables)
-    rig = tables.pop("rig", {})
-    stack = Stack(path, base or Path.cwd(), text, RigTable.model_construct(), tables)
+    rig, hosts = tables.pop("rig", {}), tables.pop("hosts", {})
+    if hosts:
+        tables |= {name: tables.pop(name, {}) for name in (RELAY, ROUTER)}  # last to stop: others are heard to the end
+    stack = Stack(path, base or Path.cwd(), text, RigTable.model_construct(), tables, Placement({}, {}))
+    checked = {name: stack._checked(f"hosts.{name}", HostTable, table) for name, table in hosts.items()}
+    if wrong := next((name for name in hosts if not re.fullmatch(HOST_NAME, name)), None):
+        raise UserError(f"{stack._where(f'hosts.{wrong}')}: {wrong!r} is no host's name: letters, digits and -")
     try:
-        return Stack(path, stack.base, text, RigTable.model_validate(rig), tables)
-    except ValidationError as error:
-        raise UserError(stack._explain("rig", RigTable, error)) from None
+        placement = placement_of(checked, tables)
+    except UserError as error:
+        raise UserError(f"{label}: {error}") from None
+    return replace(stack, rig=stack._checked("rig", RigTable, rig), placement=placement)
 
 
 def stock(kind: str) -> dict[str, Path]:
@@ -210,7 +251,7 @@ def line_of(text: str, table: str, key: str = "") -> int | None:
     """Line number of a key in a table, of the table's head when it has no such key, None when neither."""
     current, head = "", None
     for number, line in enumerate(text.splitlines(), 1):
-        if match := re.match(r"\s*\[\s*([\w-]+)\s*\]", line):
+        if match := re.match(r"\s*\[\s*([\w.-]+)\s*\]", line):
             current = match[1]
             if current == table:
                 head = number
@@ -224,9 +265,13 @@ def _override(tables: dict[str, Any], override: str) -> None:
     table, dot, key = target.strip().partition(".")
     if not (separator and dot and key):
         raise UserError(f"--set {override}: this is not table.key=value, e.g. --set decoder.mode=interleaved")
-    if table != "rig" and table not in tables:
+    if table not in ("rig", ROUTER, RELAY) and table not in tables:
         raise UserError(f"--set {override}: the stack has no table [{table}]; {_nearest(table, tables)}")
-    tables.setdefault(table, {})[key] = _plain_value(value.strip())
+    *within, last = key.split(".")  # hosts.NAME.key
+    keys = tables.setdefault(table, {})
+    for name in within:
+        keys = keys.setdefault(name, {})
+    keys[last] = _plain_value(value.strip())
 
 
 def _plain_value(text: str) -> Any:
