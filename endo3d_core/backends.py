@@ -71,10 +71,9 @@ class PointTracker:
             count = self.view.load(channels)
         except ValueError:
             count = 0
-        points = self.view.live[..., :3].reshape(-1, 3).astype(np.float64)
         if count < 100:
             return Estimate(np.eye(4), np.zeros((6, 6)), State.LOST, np.inf, np.zeros(6), 0.0, np.nan, 0.0, 0)
-        T, information = self.registration.register(np.ascontiguousarray(points[np.isfinite(points[:, 2])]))
+        T, information = self.registration.register(self.view.points())
         self.map.merge(self.view.live, T, sequence)
         values, vectors = np.linalg.eigh(information)
         sigma_mm = float(self.view.sigma_mm / np.sqrt(values[0])) if values[0] > 0 else np.inf

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
 from endo3d_core import normals, pooling
+from endo3d_core.compiled import kernel
 from endo3d_core.grid_rays import GridRays, fit_grid_rays
 
 POOL = 2
@@ -24,8 +27,10 @@ class LiveView:
         self.rays: GridRays | None = None
         self.count = 0
         """Valid pooled cells."""
-        self.live = np.empty((0, 0, normals.LIVE), np.float32)
-        """(rows, columns, LIVE) float32, see ``normals``."""
+        self._learnt_from = 0
+        """Those of the cloud that the rays come from."""
+        self.live = np.empty((pooling.PLANES, 0, 0), np.float32)
+        """(PLANES, rows, columns) float32, see ``pooling``."""
         self.coefficients = np.zeros((2, 5), np.float32)
         """The pooled grid's rays."""
         self.sigma_mm = np.nan
@@ -38,44 +43,57 @@ class LiveView:
 
         Raises ValueError when the cloud is not organised by rays, or too empty to tell.
         """
-        self._learn_rays(channels)
-        assert self.rays is not None
-        pitch_mm = _typical(channels[..., 2]) / self.rays.focal_cells
-        self.count = pooling.pool(channels, STEEPEST * pitch_mm, self._planes)
+        known = self.rays is not None and self.rays.shape == channels.shape[:2]
+        if not known or self._pool(channels) > _REFIT_GROWTH * self._learnt_from:
+            self._learn_rays(channels)
         if self.count == 0:
             return 0
-        half = max(round(TEXTURE_BOX * self.live.shape[1] / 2), 2)
-        pooling.high_pass(self._planes, half, self._work)
-        self.pitch_mm = POOL * pitch_mm
-        normals.slopes(self._planes[pooling.Z], 2 * STEEPEST * self.pitch_mm, self._slopes)
-        grey = _typical(self._planes[pooling.INTENSITY])
-        normals.gather(self._planes, self._slopes, self.coefficients, grey, self.live)
-        self.sigma_mm = _typical(self._planes[pooling.SIGMA])
+        assert self.rays is not None
+        columns = self.live.shape[2]
+        half = min(max(round(TEXTURE_BOX * columns / 2), 2), columns // 2)
+        pooling.high_pass(self.live, half, self._work)
+        self.pitch_mm = POOL * typical(self.live[pooling.Z], 1.0) / self.rays.focal_cells
+        normals.slopes(self.live[pooling.Z], 2 * STEEPEST * self.pitch_mm, self._slopes)
+        normals.orient(self._slopes, self.coefficients, typical(self.live[pooling.GREY], 1.0), self.live)
+        self.sigma_mm = 1.0 / math.sqrt(typical(self.live[pooling.WEIGHT], 1.0))
         return self.count
 
     @property
     def normal_rad(self) -> float:
         """1-sigma of a normal's tilt from this one cloud."""
-        return float(np.sqrt(normals.SLOPE_VARIANCE)) * self.sigma_mm / self.pitch_mm
+        return math.sqrt(normals.SLOPE_VARIANCE) * self.sigma_mm / self.pitch_mm
+
+    def points(self) -> NDArray[np.float64]:
+        """(n, 3) float64 valid pooled points, mm in the camera's axes."""
+        xyz = self.live[: pooling.Z + 1].reshape(3, -1)
+        return np.ascontiguousarray(xyz[:, np.isfinite(xyz[pooling.Z])].T, np.float64)
+
+    def _pool(self, channels: NDArray[np.float32]) -> int:
+        assert self.rays is not None
+        lines = channels.reshape(len(channels), -1)
+        self.count = pooling.pool(lines, STEEPEST / self.rays.focal_cells, self._cells, self._weights, self.live)
+        return self.count
 
     def _learn_rays(self, channels: NDArray[np.float32]) -> None:
         shape = channels.shape[:2]
-        if self.rays is not None and self.rays.shape == shape:
-            valid = int(np.isfinite(channels[::3, ::3, 2]).sum())
-            if valid <= _REFIT_GROWTH * self.rays.fitted_cells:
-                return
         self.rays = fit_grid_rays(channels)
         self.coefficients = (self.rays.coefficients / POOL).astype(np.float32)
         self.coefficients[:, 0] -= np.float32(0.5 * (POOL - 1) / POOL)
         rows, columns = shape[0] // POOL, shape[1] // POOL
-        self._planes = np.empty((pooling.PLANES, rows, columns), np.float32)
+        self._cells, self._weights = np.empty((2, 5, pooling.SPAN), np.float32), np.empty((5, pooling.SPAN), np.float32)
         self._slopes = np.empty((2, rows, columns), np.float32)
-        self._work = np.empty((4, columns + 1), np.float64)
-        self.live = np.empty((rows, columns, normals.LIVE), np.float32)
+        self._work = np.empty((4, columns + 1), np.float32)
+        self.live = np.empty((pooling.PLANES, rows, columns), np.float32)
+        self._learnt_from = self._pool(channels)
 
 
-def _typical(plane: NDArray[np.float32], stride: int = 8) -> float:
-    """The median of every ``stride``th row and column, or 1 where all is NaN."""
-    values = plane[::stride, ::stride].ravel()
-    values = values[values == values]
-    return float(np.median(values)) if values.size else 1.0
+@kernel
+def typical(plane: NDArray[np.float32], otherwise: float, stride: int = 8) -> float:
+    """The median of every ``stride``th row and column, or ``otherwise`` where all is NaN."""
+    values = np.empty((plane.shape[0] // stride + 1) * (plane.shape[1] // stride + 1), np.float32)
+    n = 0
+    for r in range(0, plane.shape[0], stride):
+        for c in range(0, plane.shape[1], stride):
+            values[n] = plane[r, c]
+            n += 1 if values[n] == values[n] else 0
+    return float(np.median(values[:n])) if n > 0 else otherwise

@@ -15,8 +15,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from endo3d_core import voxel_hash
+from endo3d_core import pooling, voxel_hash
 from endo3d_core.compiled import kernel
+from endo3d_core.pooling import GX, GY, GZ, NX, NY, NZ, X, Y, Z
 
 MAP_POINT = np.dtype(
     [(name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz", "intensity", "sigma")]
@@ -37,6 +38,10 @@ TAG = 4
 
 CONFIRMED = 8
 """Measured points from which on a map point is believed and published."""
+SETTLED = 16
+"""Measured points from which on one more changes little: a map point's noise is a quarter of one's."""
+_SETTLED_SHARE = 0.9
+"""Of the map points that a cloud fell onto: if more had settled, the next cloud is merged by half."""
 _OUTLIER_AGE = 60
 """Clouds after which a map point that is still unconfirmed is an outlier (a third of a second)."""
 _CROWDED = 0.95
@@ -76,8 +81,9 @@ class MergedMap:
         self.free = np.empty(capacity, np.int32)
         self.dirty = np.empty(capacity, np.int32)
         self._removed = np.empty((capacity, 3), np.int16)
-        self._touched = np.empty(1, np.int32)
-        self.counters = np.zeros(8, np.int64)
+        self._touched = np.empty(0, np.int32)
+        self._turn = 0
+        self.counters = np.zeros(10, np.int64)
         self.clear()
 
     def clear(self) -> None:
@@ -86,7 +92,7 @@ class MergedMap:
         self.counters[:] = 0
 
     # The kernels' counters: rows ever used, free rows, dirty rows, removed keys, touched rows, sweep position, refused
-    # points, first cloud.
+    # points, first cloud, and of the last cloud: voxels that were there, and those of them that had settled.
     @property
     def used(self) -> int:
         """Rows in use or free again: every live row lies below."""
@@ -108,15 +114,22 @@ class MergedMap:
         return self._touched[: self.counters[4]]
 
     def merge(self, live: NDArray[np.float32], T_world_camera: NDArray[np.float64], sequence: int) -> None:
-        """Merges the points of ``live`` (rows, columns, LIVE), seen from a pose (4, 4), as cloud ``sequence``."""
+        """Merges a cloud ``live`` (PLANES, rows, columns), seen from a pose (4, 4), as cloud ``sequence``.
+
+        Where nearly everything in view has settled, only every second line is merged, even and odd ones in turn.
+        """
         if self.count == 0:
             self.counters[7] = sequence
-        if self._touched.size < live.shape[0] * live.shape[1]:
-            self._touched = np.empty(live.shape[0] * live.shape[1], np.int32)
+        if self._touched.size < live[Z].size:
+            self._touched = np.empty(live[Z].size, np.int32)
+            self._world = np.empty((3, live.shape[2]), np.float32)
+            self._voxels, self._found = np.empty(live.shape[2], np.int64), np.empty(live.shape[2], np.int32)
+        halved = self.counters[9] > _SETTLED_SHARE * self.counters[8]
+        self._turn = 1 - self._turn if halved else 0
         _merge(
             live, np.ascontiguousarray(T_world_camera, np.float64), self.merging_distance_mm, sequence,
-            self.keys, self.index, self.rows, self.ints, self.tags, self.moved,
-            self.free, self.dirty, self._touched, self.counters,
+            self._turn, 2 if halved else 1, self.keys, self.index, self.rows, self.ints, self.tags, self.moved,
+            self.free, self.dirty, self._touched, self._world, self._voxels, self._found, self.counters,
         )  # fmt: skip
         _sweep(
             sequence, min(_SWEPT, self.used), self.keys, self.index, self.ints, self.tags,
@@ -154,15 +167,13 @@ class MergedMap:
 
 
 @kernel
-def _along_axis(keys: Any, index: Any, rows: Any, kx: Any, ky: Any, kz: Any, axis: Any, place: Any, d: Any) -> Any:
+def _along_axis(keys: Any, index: Any, rows: Any, key: Any, axis: Any, place: Any, d: Any) -> Any:
     """The row of the voxel before or behind along ``axis`` whose point lies within d of ``place``, or -1."""
     best: Any = np.int64(-1)
     best_gap = np.float32(d)
-    for step in (-1, 1):
-        key = voxel_hash.pack(
-            kx + (step if axis == 0 else 0), ky + (step if axis == 1 else 0), kz + (step if axis == 2 else 0)
-        )
-        row = voxel_hash.find(keys, index, key)
+    stride = np.int64(1) << (32 - 16 * axis)
+    for neighbour in (key - stride, key + stride):
+        row = voxel_hash.find(keys, index, neighbour)
         if row >= 0:
             gap = abs(rows[row, axis] - place)
             if gap < best_gap:
@@ -171,67 +182,105 @@ def _along_axis(keys: Any, index: Any, rows: Any, kx: Any, ky: Any, kz: Any, axi
 
 
 @kernel
-def _merge(
-    live: Any, T: Any, d: Any, sequence: Any, keys: Any, index: Any, rows: Any, ints: Any, tags: Any, moved: Any,
-    free: Any, dirty: Any, touched: Any, counters: Any,
-) -> None:  # fmt: skip
+def _place(
+    live: Any, r: Any, T: Any, per_voxel: Any, xs: NDArray[np.float32], ys: NDArray[np.float32],
+    zs: NDArray[np.float32], voxels: NDArray[np.int64],
+) -> Any:  # fmt: skip
+    """One line of the cloud in the world: points and voxel keys, EMPTY where invalid; returns those out of range."""
     r00, r01, r02, tx = np.float32(T[0, 0]), np.float32(T[0, 1]), np.float32(T[0, 2]), np.float32(T[0, 3])
     r10, r11, r12, ty = np.float32(T[1, 0]), np.float32(T[1, 1]), np.float32(T[1, 2]), np.float32(T[1, 3])
     r20, r21, r22, tz = np.float32(T[2, 0]), np.float32(T[2, 1]), np.float32(T[2, 2]), np.float32(T[2, 3])
+    px, py, pz = live[X, r], live[Y, r], live[Z, r]
+    scale, offset = np.float32(per_voxel), np.float32(voxel_hash.OFFSET)
+    one, end = np.float32(1.0), np.float32(2 * voxel_hash.OFFSET - 2)
+    beyond = 0
+    for c in range(voxels.size):
+        a, b, e = px[c], py[c], pz[c]
+        x, y, z = r00 * a + r01 * b + r02 * e + tx, r10 * a + r11 * b + r12 * e + ty, r20 * a + r21 * b + r22 * e + tz
+        # Positive, so that cutting off the fraction rounds down.
+        fx, fy, fz = x * scale + offset, y * scale + offset, z * scale + offset
+        inside = (min(fx, min(fy, fz)) > one) & (max(fx, max(fy, fz)) < end)
+        key = (np.int64(fx) << 32) | (np.int64(fy) << 16) | np.int64(fz)
+        voxels[c] = key if inside else np.int64(voxel_hash.EMPTY)
+        beyond += 1 if (not inside) & (e == e) else 0
+        xs[c], ys[c], zs[c] = x, y, z
+    return beyond
+
+
+@kernel
+def _find_all(keys: Any, index: Any, ints: Any, voxels: NDArray[np.int64], found: NDArray[np.int32]) -> Any:
+    """The row of each voxel, -1 where there is none; returns how many there are and how many of them are settled.
+
+    Apart from the update, so that the processor waits for many cache misses at a time.
+    """
+    known = settled = 0
+    for c in range(voxels.size):
+        row = voxel_hash.find(keys, index, voxels[c]) if voxels[c] != voxel_hash.EMPTY else np.int64(-1)
+        found[c] = row
+        known += 1 if row >= 0 else 0
+        settled += 1 if (ints[max(row, 0), COUNT] >= SETTLED) & (row >= 0) else 0
+    return known, settled
+
+
+@kernel
+def _merge(
+    live: Any, T: Any, d: Any, sequence: Any, first: Any, step: Any, keys: Any, index: Any, rows: Any, ints: Any,
+    tags: Any, moved: Any, free: Any, dirty: Any, touched: Any, world: Any, voxels: Any, found: Any, counters: Any,
+) -> None:  # fmt: skip
+    r00, r01, r02 = np.float32(T[0, 0]), np.float32(T[0, 1]), np.float32(T[0, 2])
+    r10, r11, r12 = np.float32(T[1, 0]), np.float32(T[1, 1]), np.float32(T[1, 2])
+    r20, r21, r22 = np.float32(T[2, 0]), np.float32(T[2, 1]), np.float32(T[2, 2])
     axis = 2
     if abs(r02) > abs(r12) and abs(r02) > abs(r22):
         axis = 0
     elif abs(r12) > abs(r22):
         axis = 1
-    per_voxel, one = np.float32(1.0 / d), np.float32(1.0)
-    offset, two_offsets = np.float32(32768.0), np.float32(65534.0)
-    touches, waiting, refused = 0, counters[2], counters[6]
-    for r in range(live.shape[0]):
-        for c in range(live.shape[1]):
-            p = live[r, c]
-            if np.isnan(p[2]):
+    one = np.float32(1.0)
+    touches, waiting, refused, known, settled = 0, counters[2], counters[6], 0, 0
+    xs, ys, zs = world[0], world[1], world[2]
+    for r in range(first, live.shape[1], step):
+        refused += _place(live, r, T, one / np.float32(d), xs, ys, zs, voxels)
+        known_here, settled_here = _find_all(keys, index, ints, voxels, found)
+        known, settled = known + known_here, settled + settled_here
+        for c in range(voxels.size):
+            if voxels[c] == voxel_hash.EMPTY:
                 continue
-            x = r00 * p[0] + r01 * p[1] + r02 * p[2] + tx
-            y = r10 * p[0] + r11 * p[1] + r12 * p[2] + ty
-            z = r20 * p[0] + r21 * p[1] + r22 * p[2] + tz
-            # Positive, so that cutting off the fraction rounds down.
-            fx, fy, fz = x * per_voxel + offset, y * per_voxel + offset, z * per_voxel + offset
-            if not (one < min(fx, min(fy, fz)) and max(fx, max(fy, fz)) < two_offsets):
-                refused += 1
-                continue
-            kx, ky, kz = np.int64(fx) - 32768, np.int64(fy) - 32768, np.int64(fz) - 32768
-            key = voxel_hash.pack(kx, ky, kz)
-            row: Any = voxel_hash.find(keys, index, key)
+            x, y, z = xs[c], ys[c], zs[c]
+            row: Any = np.int64(found[c])
             if row < 0:
-                row = _along_axis(keys, index, rows, kx, ky, kz, axis, x if axis == 0 else (y if axis == 1 else z), d)
-            if row < 0:
-                if counters[1] > 0:
-                    counters[1] -= 1
-                    row = np.int64(free[counters[1]])
-                elif counters[0] < rows.shape[0]:
-                    row = counters[0]
-                    counters[0] += 1
-                else:
-                    refused += 1
-                    continue
-                voxel_hash.insert(keys, index, key, row)
-                rows[row] = np.float32(0.0)
-                rows[row, 0], rows[row, 1], rows[row, 2] = x, y, z
-                tags[row, 0], tags[row, 1], tags[row, 2], tags[row, PUBLISHED] = kx, ky, kz, 0
-                moved[row] = np.float32(0.0)
-                ints[row, FIRST] = sequence
-                ints[row, LAST] = sequence - 1
+                key = voxels[c]
+                row = voxel_hash.find(keys, index, key)
+                if row < 0:
+                    place = x if axis == 0 else (y if axis == 1 else z)
+                    row = _along_axis(keys, index, rows, key, axis, place, d)
+                if row < 0:
+                    if counters[1] > 0:
+                        counters[1] -= 1
+                        row = np.int64(free[counters[1]])
+                    elif counters[0] < rows.shape[0]:
+                        row = counters[0]
+                        counters[0] += 1
+                    else:
+                        refused += 1
+                        continue
+                    voxel_hash.insert(keys, index, key, row)
+                    kx, ky, kz = voxel_hash.unpack(key)
+                    rows[row] = np.float32(0.0)
+                    rows[row, 0], rows[row, 1], rows[row, 2] = x, y, z
+                    tags[row, 0], tags[row, 1], tags[row, 2], tags[row, PUBLISHED] = kx, ky, kz, 0
+                    moved[row] = np.float32(0.0)
+                    ints[row, FIRST] = sequence
+                    ints[row, LAST] = sequence - 1
             point = rows[row]
-            point[WEIGHT] += p[10]
-            share = p[10] / point[WEIGHT]
+            point[WEIGHT] += live[pooling.WEIGHT, r, c]
+            share = live[pooling.WEIGHT, r, c] / point[WEIGHT]
             dx, dy, dz = x - point[0], y - point[1], z - point[2]
             point[0] += share * dx
             point[1] += share * dy
             point[2] += share * dz
-            if p[3] == p[3]:
-                nx = r00 * p[3] + r01 * p[4] + r02 * p[5]
-                ny = r10 * p[3] + r11 * p[4] + r12 * p[5]
-                nz = r20 * p[3] + r21 * p[4] + r22 * p[5]
+            a, b, e = live[NX, r, c], live[NY, r, c], live[NZ, r, c]
+            if a == a:
+                nx, ny, nz = r00 * a + r01 * b + r02 * e, r10 * a + r11 * b + r12 * e, r20 * a + r21 * b + r22 * e
                 fresh = point[3] * point[3] + point[4] * point[4] + point[5] * point[5] == np.float32(0.0)
                 blend = one if fresh else share
                 nx, ny, nz = (
@@ -244,12 +293,13 @@ def _merge(
             off = point[3] * dx + point[4] * dy + point[5] * dz
             point[VARIANCE] = (one - share) * (point[VARIANCE] + share * off * off)
             moved[row] += share * off
-            point[GREY] += share * (p[11] - point[GREY])
-            point[TEXTURE] += share * (p[6] - point[TEXTURE])
-            if p[7] == p[7]:
-                point[10] += share * (r00 * p[7] + r01 * p[8] + r02 * p[9] - point[10])
-                point[11] += share * (r10 * p[7] + r11 * p[8] + r12 * p[9] - point[11])
-                point[12] += share * (r20 * p[7] + r21 * p[8] + r22 * p[9] - point[12])
+            point[GREY] += share * (live[pooling.GREY, r, c] - point[GREY])
+            point[TEXTURE] += share * (live[pooling.TEXTURE, r, c] - point[TEXTURE])
+            a, b, e = live[GX, r, c], live[GY, r, c], live[GZ, r, c]
+            if a == a:
+                point[10] += share * (r00 * a + r01 * b + r02 * e - point[10])
+                point[11] += share * (r10 * a + r11 * b + r12 * e - point[11])
+                point[12] += share * (r20 * a + r21 * b + r22 * e - point[12])
             ints[row, COUNT] += 1
             if ints[row, LAST] != sequence:
                 ints[row, LAST] = sequence
@@ -264,6 +314,7 @@ def _merge(
                 dirty[waiting] = row
                 waiting += 1
     counters[4], counters[2], counters[6] = touches, waiting, refused
+    counters[8], counters[9] = known, settled
 
 
 @kernel

@@ -13,14 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from endo3d_core.compiled import kernel
+from endo3d_core.pooling import GREY, GX, GY, GZ, NX, NY, NZ, TEXTURE, TEXTURE_WEIGHT, X, Y, Z
 
 SLOPE_VARIANCE = 1.0 / 50.0
 """Variance of the 5x5 regression's slope, in cell variances per cell^2."""
-LIVE = 16
-"""Columns of ``live``, see the indices below."""
-POINT, NORMAL, TEXTURE, GRADIENT, WEIGHT, GREY, TEXTURE_WEIGHT = 0, 3, 6, 7, 10, 11, 12
-"""x y z; normal towards the camera; texture and its gradient per mm in the camera's axes; 1/sigma^2 of the depth;
-intensity; the square of the surroundings' brightness, relative to the whole cloud's."""
 
 
 @kernel
@@ -124,51 +120,44 @@ def slopes(depth: NDArray[np.float32], reach_mm: float, out: NDArray[np.float32]
 
 
 @kernel
-def gather(
-    planes: NDArray[np.float32],
-    slope: NDArray[np.float32],
-    coefficients: NDArray[np.float32],
-    grey: float,
-    live: NDArray[np.float32],
+def orient(
+    slope: NDArray[np.float32], coefficients: NDArray[np.float32], grey: float, planes: NDArray[np.float32]
 ) -> None:
-    """planes (6, rows, columns) of ``pooling`` and slopes (2, rows, columns) -> live (rows, columns, LIVE).
+    """Normals, texture gradients and texture weights of planes (PLANES, rows, columns) of ``pooling``.
 
-    ``coefficients`` (2, 5) are the pooled grid's rays, ``grey`` the cloud's typical intensity. The normal is NaN
-    where the slope is, the gradient where a neighbour is missing.
+    ``slope`` (2, rows, columns) as of ``slopes``, ``coefficients`` (2, 5) the pooled grid's rays, ``grey`` the cloud's
+    typical intensity. The normal is NaN where the slope is, the gradient where a neighbour is missing.
     """
-    columns = planes.shape[2]
-    texture = planes[4]
-    one, three, sixth, nan = np.float32(1.0), np.float32(3.0), np.float32(1.0 / 6.0), np.float32(np.nan)
+    one, three, sixth, zero = np.float32(1.0), np.float32(3.0), np.float32(1.0 / 6.0), np.float32(0.0)
     per_grey = np.float32(1.0 / max(grey, 1e-6))
     ax, ak, by, bk = coefficients[0, 1], coefficients[0, 3], coefficients[1, 2], coefficients[1, 4]
-    for r in range(planes.shape[1]):
-        for c in range(columns):
-            point = live[r, c]
-            z, z_u, z_v = planes[2, r, c], slope[0, r, c], slope[1, r, c]
-            point[0], point[1], point[2] = planes[0, r, c], planes[1, r, c], z
-            sigma = planes[5, r, c]
-            point[6], point[10], point[11] = texture[r, c], one / (sigma * sigma), planes[3, r, c]
-            if not (z == z and z_u == z_u):
-                for k in (3, 4, 5, 7, 8, 9):
-                    point[k] = nan
-                continue
+    rows, inner = planes.shape[1], planes.shape[2] - 2
+    planes[NX : NZ + 1] = np.float32(np.nan)
+    planes[GX : GZ + 1] = np.float32(np.nan)
+    for r in range(1, rows - 1):
+        before, here, after = planes[TEXTURE, r - 1], planes[TEXTURE, r], planes[TEXTURE, r + 1]
+        px, py, pz, grey_row = planes[X, r], planes[Y, r], planes[Z, r], planes[GREY, r]
+        normal_x, normal_y, normal_z = planes[NX, r], planes[NY, r], planes[NZ, r]
+        gradient_x, gradient_y, gradient_z = planes[GX, r], planes[GY, r], planes[GZ, r]
+        slope_u, slope_v, weight = slope[0, r], slope[1, r], planes[TEXTURE_WEIGHT, r]
+        for i in range(inner):
+            c = i + 1
+            z, z_u, z_v = pz[c], slope_u[c], slope_v[c]
+            per_z = one / z
+            x, y = px[c] * per_z, py[c] * per_z
             # Cells per unit of x/z here: the fitted rays' Jacobian, its small cross terms left out.
-            x, y, per_z = point[0] / z, point[1] / z, one / z
-            fx, fy = ax + ak * (three * x * x + y * y), by + bk * (x * x + three * y * y)
-            # Tangents: z_u (x, y, 1) + (z / fx, 0, 0) along the row, z_v (x, y, 1) + (0, z / fy, 0) down the column.
-            nx, ny = z_u * fx * per_z, z_v * fy * per_z
+            u_x, v_y = (ax + ak * (three * x * x + y * y)) * per_z, (by + bk * (x * x + three * y * y)) * per_z
+            # Tangents: z_u (x, y, 1) + (1 / u_x, 0, 0) along the row, z_v (x, y, 1) + (0, 1 / v_y, 0) down the column.
+            nx, ny = z_u * u_x, z_v * v_y
             nz = -(one + x * nx + y * ny)
             scale = one / np.sqrt(nx * nx + ny * ny + nz * nz)
-            point[3], point[4], point[5] = nx * scale, ny * scale, nz * scale
-            before, here, after = texture[r - 1], texture[r], texture[r + 1]
-            right = before[c + 1] + here[c + 1] + after[c + 1]
-            left = before[c - 1] + here[c - 1] + after[c - 1]
-            t_u = sixth * (right - left) * fx * per_z
-            t_v = sixth * (after[c - 1] + after[c] + after[c + 1] - before[c - 1] - before[c] - before[c + 1])
-            t_v *= fy * per_z
-            # A missing neighbour makes one of the two NaN, and the sum makes it all three.
-            missing = np.float32(0.0) * (t_u + t_v)
-            point[7], point[8], point[9] = t_u + missing, t_v + missing, -(x * t_u + y * t_v)
+            normal_x[c], normal_y[c], normal_z[c] = nx * scale, ny * scale, nz * scale
+            t_u = (before[i + 2] + here[i + 2] + after[i + 2]) - (before[i] + here[i] + after[i])
+            t_v = (after[i] + after[i + 1] + after[i + 2]) - (before[i] + before[i + 1] + before[i + 2])
+            # A missing neighbour makes one of the two NaN, and the sum makes it all three, as does a missing normal.
+            missing = zero * (t_u + t_v + scale)
+            t_u, t_v = sixth * t_u * u_x + missing, sixth * t_v * v_y + missing
+            gradient_x[c], gradient_y[c], gradient_z[c] = t_u, t_v, -(x * t_u + y * t_v)
             # Grey noise g makes texture noise g / surroundings.
-            surroundings = point[11] / (one + point[6]) * per_grey
-            point[12] = surroundings * surroundings
+            surroundings = grey_row[c] / (one + here[c]) * per_grey
+            weight[c] = surroundings * surroundings

@@ -17,8 +17,8 @@ from endo3d_core.registration import Frame6, Linearisation, NormalEquations, Sca
 Array = NDArray[np.float64]
 
 ITERATIONS = 4
-_CONVERGED = 0.1
-"""A step smaller than this, in point sigmas, ends the iteration: the next would be far smaller still."""
+_CONVERGED = 0.4
+"""A step smaller than this, in point sigmas, ends the iteration: the next would be five times smaller."""
 _COARSE = 4
 """The first iteration only has to take in what the prediction missed: every fourth map point does."""
 _LEAST_POINTS = 300
@@ -209,8 +209,10 @@ class Odometry:
     def _advance(self, T: Array, stamp_ns: int, held: Array, frame: Frame6) -> None:
         """The new pose, and the velocity for the next prediction: none along held directions."""
         assert self._last_ns is not None
-        moved = health.scaled_twist(rigid.inverse(self.T_world_camera) @ T, frame)
-        moved -= held @ (held.T @ moved)
+        motion = rigid.inverse(self.T_world_camera) @ T
+        if held.size:
+            moved = health.scaled_twist(motion, frame)
+            motion = health.motion(moved - held @ (held.T @ moved), frame)
         self._period_ns = max(stamp_ns - self._last_ns, 1)
-        self._velocity = rigid.log(health.motion(moved, frame)) / self._period_ns
+        self._velocity = rigid.log(motion) / self._period_ns
         self.T_world_camera, self._last_ns = T, stamp_ns

@@ -19,6 +19,7 @@ from endo3d_core import health, rigid
 from endo3d_core.compiled import kernel
 from endo3d_core.live_view import LiveView
 from endo3d_core.merging import CONFIRMED, COUNT, MergedMap
+from endo3d_core.pooling import TEXTURE, Z
 from endo3d_core.registration import Frame6, Linearisation, NormalEquations, Scales, visible_surface
 
 Array = NDArray[np.float64]
@@ -145,7 +146,7 @@ def shifts(frame: Frame6, view: LiveView) -> Array:
 def scores(map_rows: Any, chosen: Any, live: Any, coefficients: Any, poses: Any, gate: Any) -> Any:
     """poses (n, 4, 4) T_camera_world -> (n,): share of points in place, times agreement of their texture."""
     f = np.float32
-    rows, columns = live.shape[0], live.shape[1]
+    rows, columns = live.shape[1], live.shape[2]
     out = np.zeros(poses.shape[0])
     c, d = coefficients[0], coefficients[1]
     for k in range(poses.shape[0]):
@@ -164,15 +165,15 @@ def scores(map_rows: Any, chosen: Any, live: Any, coefficients: Any, poses: Any,
             v = d[0] + d[1] * a + d[2] * b + r2 * (d[3] * a + d[4] * b) + f(0.5)
             if not (u > f(0.0) and v > f(0.0) and u < f(columns) and v < f(rows)):
                 continue
-            q = live[int(v), int(u)]
-            if np.isnan(q[2]):
+            depth, texture = live[Z, int(v), int(u)], live[TEXTURE, int(v), int(u)]
+            if np.isnan(depth):
                 continue
             seen += 1
-            if abs(q[2] - z) < gate:
+            if abs(depth - z) < gate:
                 near += 1
-                both += m[9] * q[6]
+                both += m[9] * texture
                 of_map += m[9] * m[9]
-                of_live += q[6] * q[6]
+                of_live += texture * texture
         if seen > chosen.size // 8:
             out[k] = near / seen * (f(1.0) + both / np.sqrt(of_map * of_live))
     return out

@@ -14,18 +14,19 @@ from numpy.typing import NDArray
 from endo3d_core.compiled import kernel
 
 EMPTY = -1
-KEY_LIMIT = 32767
+OFFSET = 32768
+"""What makes a signed number of the key positive."""
 
 
 @kernel
 def pack(kx: Any, ky: Any, kz: Any) -> Any:
     """Three keys within +-32767 -> one."""
-    return ((np.int64(kx) + 32768) << 32) | ((np.int64(ky) + 32768) << 16) | (np.int64(kz) + 32768)
+    return ((np.int64(kx) + OFFSET) << 32) | ((np.int64(ky) + OFFSET) << 16) | (np.int64(kz) + OFFSET)
 
 
 @kernel
 def unpack(key: int) -> tuple[int, int, int]:
-    return ((key >> 32) & 0xFFFF) - 32768, ((key >> 16) & 0xFFFF) - 32768, (key & 0xFFFF) - 32768
+    return ((key >> 32) & 0xFFFF) - OFFSET, ((key >> 16) & 0xFFFF) - OFFSET, (key & 0xFFFF) - OFFSET
 
 
 @kernel
