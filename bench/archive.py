@@ -30,7 +30,7 @@ from endo3d.schemas import messages as m
 from endo3d.schemas.topics import Topic
 from endo3d.services.archive.compact import Packer
 from endo3d.services.archive.reader import Log
-from endo3d.services.archive.sink import FileSink
+from endo3d.services.archive.sink import file_sink
 from endo3d.services.archive.writer import Kind, Writer
 from endo3d.services.recorder import Recorder, RecorderConfig
 from endo3d.services.runtime import replay as engine
@@ -119,7 +119,7 @@ def burst(scan: Scan, folder: Path) -> None:
     for place, target in (("null", lambda: Path("/dev/null")), ("disk", lambda: _fresh(folder))):
         for name, write in (
             ("bare write()", _bare),
-            ("bare writev() + drop-behind", _bare_sink),
+            ("bare direct write", _bare_sink),
             ("endo3d", _ours),
             ("endo3d compact", lambda path, items: _ours(path, items, packer)),
             ("mcap Writer, 1 MiB chunks, CRC", _library),
@@ -150,7 +150,7 @@ def _bare(path: Path, frames: list[memoryview]) -> int:
 
 
 def _bare_sink(path: Path, frames: list[memoryview]) -> int:
-    sink = FileSink(path)
+    sink = file_sink(path)
     for frame in frames:
         sink.write(frame)
     sink.close()
@@ -158,7 +158,7 @@ def _bare_sink(path: Path, frames: list[memoryview]) -> int:
 
 
 def _ours(path: Path, frames: list[memoryview], pack: Packer | None = None) -> int:
-    writer = Writer(FileSink(path), "bench")
+    writer = Writer(file_sink(path), "bench")
     channel = writer.channel("/frame", FRAME_KIND)
     for k, frame in enumerate(frames):
         writer.put(channel, k, START_NS + k, START_NS + k, *(pack(frame) if pack else (frame,)))

@@ -138,7 +138,7 @@ class Player(Source[PlayerConfig]):
         if math.isfinite(self.config.end_s):
             end_ns = log.start_ns + round(self.config.end_s * 1e9)
         start_ns = log.start_ns + round(position_s * 1e9)
-        self._records = log.records(self._topics, start_ns=start_ns, end_ns=end_ns)
+        self._records = log.records(self._topics, start_ns=start_ns, end_ns=end_ns, check=False)
         self._waiting = None
         self._position_s = position_s
         self._anchor = None

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
 from endo3d.services.archive.entry import Attachment, Entry
 from endo3d.services.archive.facts import LIBRARY
-from endo3d.services.archive.sink import FileSink, Sink
+from endo3d.services.archive.sink import Sink, file_sink
 from endo3d.services.archive.writer import Writer
 
 NS_PER_S = 1_000_000_000
@@ -29,7 +30,7 @@ class Recording:
         *,
         split_bytes: int = 0,
         split_s: float = 0.0,
-        open_sink: Callable[[Path], Sink] = FileSink,
+        open_sink: Callable[[Path], Sink] = file_sink,
     ) -> None:
         self.path = path
         self._facts = dict(facts)
@@ -92,13 +93,12 @@ class Recording:
             self.finish()
         path = self._unused_path()
         path.parent.mkdir(parents=True, exist_ok=True)
-        sink = self._open_sink(path)
-        try:
+        with ExitStack() as undo:
+            undo.callback(path.unlink, missing_ok=True)
+            sink = self._open_sink(path)
+            undo.callback(sink.close)
             self._writer = writer = Writer(sink, LIBRARY)
-        except OSError:
-            sink.close()
-            path.unlink()
-            raise
+            undo.pop_all()
         self.parts.append(path)
         self._part_start_ns = entry.log_ns
         writer.note("endo3d", self._facts | {"part": str(len(self.parts) - 1)})

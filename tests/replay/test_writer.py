@@ -15,7 +15,7 @@ from recorded import pose, same
 
 from endo3d.schemas import codec, topics
 from endo3d.services.archive.reader import Log, Unreadable
-from endo3d.services.archive.sink import FileSink, _after
+from endo3d.services.archive.sink import _after, file_sink
 from endo3d.services.archive.writer import OWN_CHUNK_BYTES, Kind, Writer
 
 KINDS = (Kind("one.Kind", "protobuf", b"definition"), Kind("other.Kind", "json", b""))
@@ -33,7 +33,7 @@ puts = st.lists(
 @given(puts)
 def test_the_library_reads_what_was_put(tmp_path: Path, items: list[tuple[int, int, int, bool]]) -> None:
     path = tmp_path / "log.mcap"
-    writer = Writer(FileSink(path), "test")
+    writer = Writer(file_sink(path), "test")
     expected = []
     for sequence, (channel, log_ns, size, flush) in enumerate(items):
         payload = bytes([sequence]) * size
@@ -70,7 +70,7 @@ def test_the_library_reads_what_was_put(tmp_path: Path, items: list[tuple[int, i
 
 def test_large_messages_have_chunks_of_their_own_and_small_ones_share(tmp_path: Path) -> None:
     path = tmp_path / "log.mcap"
-    writer = Writer(FileSink(path), "test")
+    writer = Writer(file_sink(path), "test")
     image, small = writer.channel("/image", KINDS[0]), writer.channel("/pose", KINDS[0])
     for sequence in range(5):
         writer.put(image, sequence, sequence, 0, bytes(OWN_CHUNK_BYTES))
@@ -134,7 +134,7 @@ def test_a_file_that_is_no_log_says_so(tmp_path: Path, content: bytes | None, co
 
 def test_a_window_of_time(tmp_path: Path) -> None:
     path = tmp_path / "log.mcap"
-    writer = Writer(FileSink(path), "test")
+    writer = Writer(file_sink(path), "test")
     channel = writer.channel("/x", KINDS[0])
     for log_ns in (5, 1, 3, 2, 4):
         writer.put(channel, log_ns, log_ns, 0, b"")
