@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, Literal, get_args
 
 import cv2
@@ -16,6 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 Kind = Literal["checkerboard", "circles", "asymmetric-circles", "charuco"]
+CIRCLE = 0.3
+"""Radius of a circle, of the pitch."""
+DRAWN_PX = 240
+"""Side of a square in OpenCV's drawing of a ChArUco board."""
 Features = tuple[NDArray[np.float64], NDArray[np.float64]]
 """Board points (n, 3) mm with z = 0, and where they are seen (n, 2) px."""
 
@@ -110,14 +115,38 @@ class Board:
         clear = (1 - self.marker_mm / self.pitch_mm) / 2  # of a square: where the nearest marker begins
         return self.points_mm[np.asarray(ids).ravel()], _refined(image, _pixels(corners), clear)
 
-    def drawn(self, square_px: int) -> NDArray[np.uint8]:
-        """A ChArUco board as OpenCV draws it: (rows, columns) times ``square_px``, 0 or 255."""
-        size = (self.columns * square_px, self.rows * square_px)
-        return np.asarray(self._charuco().generateImage(size), np.uint8)
+    def dark(self, x_mm: NDArray[np.float64], y_mm: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """(rows, columns): where the print is black, at x (columns,) and y (rows, 1) of the board's plane."""
+        match self.kind:
+            case "checkerboard":
+                column, row = np.floor(x_mm / self.pitch_mm), np.floor(y_mm / self.pitch_mm)
+                inside = (column >= -1) & (column < self.columns) & (row >= -1) & (row < self.rows)
+                return np.asarray(inside & ((column + row) % 2 == 0))
+            case "charuco":
+                drawn = _drawing(self)
+                per_mm = DRAWN_PX / self.pitch_mm
+                column, row = (np.floor(axis * per_mm).astype(np.int64) for axis in (x_mm, y_mm))
+                height, width = drawn.shape
+                inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+                return np.asarray(inside & (drawn[row.clip(0, height - 1), column.clip(0, width - 1)] == 0))
+            case _:
+                radius = CIRCLE * self.pitch_mm
+                dark = np.zeros(np.broadcast(x_mm, y_mm).shape, np.bool_)
+                for cx, cy, _ in self.points_mm:
+                    rows, columns = np.abs(y_mm[:, 0] - cy) < radius, np.abs(x_mm - cx) < radius
+                    part = np.hypot(x_mm[columns] - cx, y_mm[rows] - cy) < radius
+                    dark[np.ix_(rows, columns)] |= part
+                return dark
 
     def _charuco(self) -> Any:
         dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{self.dictionary}"))
         return cv2.aruco.CharucoBoard((self.columns, self.rows), self.pitch_mm, self.marker_mm, dictionary)
+
+
+@lru_cache(maxsize=2)
+def _drawing(board: Board) -> NDArray[np.uint8]:
+    size = (board.columns * DRAWN_PX, board.rows * DRAWN_PX)
+    return np.asarray(board._charuco().generateImage(size), np.uint8)
 
 
 def _pixels(found: Any) -> NDArray[np.float64]:
