@@ -138,7 +138,8 @@ class Relay(Gateway[RelayConfig]):
         lost = self._tally.snapshot()[2]
         for host, senders in self._senders.items():
             lost |= {f"{sender.topic.name}:no room to {host}": sender.waiting.lost for sender in senders}
-        return lost | {f"{topic}:late": ordered.late for topic, ordered in self._ordered.items() if ordered.late}
+        lost |= {f"{topic}:late": ordered.late for topic, ordered in self._ordered.items()}
+        return {cause: count for cause, count in lost.items() if count}
 
     def trouble(self) -> str:
         if not self._lines or not self._lines[0].up:

@@ -26,7 +26,7 @@ class Exchange(NamedTuple):
 class Offset:
     """The offset by the quickest of the last exchanges: queues make a way longer, never shorter (RFC 5905, 10)."""
 
-    def __init__(self, exchanges: int = 16) -> None:
+    def __init__(self, exchanges: int = 60) -> None:
         self._exchanges: deque[Exchange] = deque(maxlen=exchanges)
 
     def add(self, exchange: Exchange) -> None:
