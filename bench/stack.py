@@ -29,19 +29,25 @@ FRAMES = Path("build/bench/contour-172hz.mcap")
 READERS = ("decoder", "odometry", "recorder")
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--seconds", type=float, default=SECONDS, help="how much of the log is played")
-    end_s = parser.parse_args().seconds
+def prerendered() -> Path:
+    """The log that plays the camera, rendered if it isn't there."""
     if not FRAMES.exists():
         FRAMES.parent.mkdir(parents=True, exist_ok=True)
         endo3d = [sys.executable, "-m", "endo3d.services.cli.app", "render", SCENE, "-o", str(FRAMES)]
         subprocess.run([*endo3d, "--preset", "fast", "--rate", str(RATE_HZ), "--seconds", str(SECONDS)], check=True)
-    log = Log(FRAMES)
+    return FRAMES
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--seconds", type=float, default=SECONDS, help="how much of the log is played")
+    end_s = parser.parse_args().seconds
+    frames = prerendered()
+    log = Log(frames)
     end_ns = log.start_ns + round(end_s * 1e9)
     rendered = sum(1 for _ in log.records((topics.FRAME,), end_ns=end_ns))  # with every page into memory
-    with tempfile.TemporaryDirectory(dir=FRAMES.parent) as folder:
-        settings = [f"rig.name=stack{os.getpid()}", f"player.log={FRAMES.resolve()}", "viewer.port=0"]
+    with tempfile.TemporaryDirectory(dir=frames.parent) as folder:
+        settings = [f"rig.name=stack{os.getpid()}", f"player.log={frames.resolve()}", "viewer.port=0"]
         settings += [f"player.end_s={end_s}", f"recorder.directory={folder}", "recorder.name=scan", "viewer.web_port=0"]
         before = psutil.cpu_times()
         run = scan("player", settings, seconds=10 * SECONDS, quiet=True)

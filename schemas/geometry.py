@@ -53,13 +53,19 @@ def quaternion(R: NDArray[np.float64]) -> tuple[float, float, float, float]:
 
 def rotation(x: float, y: float, z: float, w: float) -> NDArray[np.float64]:
     """(3, 3) float64 of a unit quaternion."""
+    return _rigid(x, y, z, w, (0.0, 0.0, 0.0))[:3, :3]
+
+
+def _rigid(x: float, y: float, z: float, w: float, t: tuple[float, float, float]) -> NDArray[np.float64]:
+    """(4, 4) float64 of a unit quaternion and a translation; from one flat tuple, which numpy takes fastest."""
     return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+        (
+            1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w), t[0],
+            2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w), t[1],
+            2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y), t[2],
+            0.0, 0.0, 0.0, 1.0,
+        )
+    ).reshape(4, 4)  # fmt: skip
 
 
 def fill_transform(translation: Any, orientation: Any, T: NDArray[np.float64]) -> None:
@@ -78,14 +84,11 @@ def read_transform(translation: Any, orientation: Any, has_rotation: bool) -> ND
         w = norm = 1.0
     if not 0 < norm < math.inf:
         raise Malformed(f"({x}, {y}, {z}, {w}) is not a rotation")
-    T = np.eye(4)
-    T[:3, :3] = rotation(x / norm, y / norm, z / norm, w / norm)
-    T[:3, 3] = translation.x, translation.y, translation.z
-    return T
+    return _rigid(x / norm, y / norm, z / norm, w / norm, (translation.x, translation.y, translation.z))
 
 
 def read_matrix(values: Any, rows: int, columns: int, what: str) -> NDArray[np.float64]:
     """(rows, columns) float64 of a repeated double, row-major."""
     if len(values) != rows * columns:
         raise Malformed(f"{what} has {len(values)} numbers, not {rows} x {columns}")
-    return np.array(values, np.float64).reshape(rows, columns)
+    return np.fromiter(values, np.float64, rows * columns).reshape(rows, columns)

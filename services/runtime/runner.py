@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
+import gc
 import logging
-import os
 import signal
 import sys
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from types import FrameType
 from typing import Any, Final
 
 from endo3d.schemas import topics
 from endo3d.schemas.messages import Message, ServiceState, Status
 from endo3d.services.runtime import log as logs
+from endo3d.services.runtime import priority
 from endo3d.services.runtime.bus import Bus
 from endo3d.services.runtime.errors import UserError
 from endo3d.services.runtime.meter import Meter
@@ -42,9 +43,9 @@ def run(
     """
     logs.to_stderr()
     sys.setswitchinterval(_SWITCH_S)
-    os.setpriority(os.PRIO_PROCESS, 0, max(service.nice, os.getpriority(os.PRIO_PROCESS, 0)))
+    priority.settle(service.nice)
     with Bus.open(rig, name=name, port=port, shm_mb=shm_mb) as bus:
-        runner = Runner(service, bus, host)
+        runner = Runner(service, bus, host, when_ready=_settle_memory)
 
         def stop(number: int, frame: FrameType | None) -> None:
             runner.stop()
@@ -57,12 +58,21 @@ def run(
                 signal.signal(number, handler)
 
 
+def _settle_memory() -> None:
+    """What is there when the work begins stays: the collector need not go through it again."""
+    gc.collect()
+    gc.freeze()
+
+
 class Runner:
     """One service on a bus. Its step, poll and command never run at the same time."""
 
-    def __init__(self, service: Service[Any], bus: Bus, host: str = "") -> None:
+    def __init__(
+        self, service: Service[Any], bus: Bus, host: str = "", when_ready: Callable[[], None] = lambda: None
+    ) -> None:
         self._service = service
         self._bus = bus
+        self._when_ready = when_ready
         self._turn = Turn()
         self._meter = Meter(host)
         self._stopped = threading.Event()
@@ -90,6 +100,7 @@ class Runner:
             self._service.open()
             self._is_open = True
             self._service.warm()
+            self._when_ready()
             self._connect()
             self._state = ServiceState.READY
             self._work()

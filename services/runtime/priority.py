@@ -1,0 +1,37 @@
+"""Who gets the processor first when there is too little of it: what may not lose a frame, then who only looks on.
+
+Ordinary users may do all of this: nothing is raised above other programs.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import platform
+import struct
+import sys
+from typing import Final
+
+_SLICE_NS: Final = 300_000
+"""What a service of the frames' path asks the scheduler for at a time: who asks for little is let in at once."""
+_SCHED_SETATTR: Final = {"x86_64": 314, "aarch64": 274}
+"""The system call's number; the C library has no name for it."""
+_ATTRIBUTES: Final = struct.Struct("IIQiIQQQ")
+"""struct sched_attr: size, policy, flags, nice, priority, runtime (the slice), deadline, period."""
+
+
+def settle(nice: int) -> None:
+    """Set this thread's priority, and that of all threads it starts from now on.
+
+    nice: 0 for the frames' path. A service that yields by more than that also interrupts nobody when it wakes
+    (SCHED_BATCH).
+    """
+    nice = max(nice, os.getpriority(os.PRIO_PROCESS, 0))
+    os.setpriority(os.PRIO_PROCESS, 0, nice)
+    if sys.platform != "linux":
+        return
+    if nice > 0:
+        os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
+    elif (number := _SCHED_SETATTR.get(platform.machine())) is not None:
+        attributes = _ATTRIBUTES.pack(_ATTRIBUTES.size, os.SCHED_OTHER, 0, nice, 0, _SLICE_NS, 0, 0)
+        ctypes.CDLL(None).syscall(number, 0, attributes, 0)  # a kernel before 6.12 goes on as it was
