@@ -15,6 +15,7 @@ import os
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -116,24 +117,29 @@ def burst(scan: Scan, folder: Path) -> None:
     print(f"as fast as it goes: {BURST} frames of {len(frames[0]) / 1e6:.2f} MB")
     packer = Packer()
     packer(frames[0])  # compiles
-    for place, target in (("null", lambda: Path("/dev/null")), ("disk", lambda: _fresh(folder))):
-        for name, write in (
-            ("bare write()", _bare),
-            ("bare direct write", _bare_sink),
-            ("endo3d", _ours),
-            ("endo3d compact", lambda path, items: _ours(path, items, packer)),
-            ("mcap Writer, 1 MiB chunks, CRC", _library),
-            ("foxglove-sdk writer", _foxglove),
-        ):
+    writers: tuple[tuple[str, Write], ...] = (
+        ("bare write()", _bare),
+        ("bare direct write", _bare_sink),
+        ("endo3d", _ours),
+        ("endo3d compact", lambda path, items: _ours(path, items, packer)),
+        ("mcap Writer, 1 MiB chunks, CRC", _library),
+        ("foxglove-sdk writer", _foxglove),
+    )
+    for place in ("null", "disk"):
+        for name, write in writers:
             if place == "null" and write is _foxglove:
                 continue  # it wants a file that it can seek in
-            path = target()
+            path = Path("/dev/null") if place == "null" else _fresh(folder)
             with Measured() as measured:
                 written = write(path, frames)
             note = f"{size / written:.2f}:1" if written else ""
             show(f"{name} -> {place}", size, measured, BURST, note)
             if place == "disk":
                 path.unlink()
+
+
+Write = Callable[[Path, list[memoryview]], int]
+"""Writes frames into a file; the bytes it took where that says something."""
 
 
 def _fresh(folder: Path) -> Path:
@@ -173,8 +179,8 @@ def _library(path: Path, frames: list[memoryview]) -> int:
         schema = writer.register_schema(FRAME_KIND.name, FRAME_KIND.encoding, FRAME_KIND.definition)
         channel = writer.register_channel("/frame", "protobuf", schema)
         for k, frame in enumerate(frames):
-            writer.add_message(channel, START_NS + k, frame, START_NS + k, k)
-        writer.finish()
+            writer.add_message(channel, START_NS + k, frame, START_NS + k, k)  # type: ignore[arg-type]  # any buffer
+        writer.finish()  # type: ignore[no-untyped-call]
     return 0
 
 

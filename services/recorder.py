@@ -7,7 +7,7 @@ import math
 import os
 import threading
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from functools import partial
@@ -20,14 +20,13 @@ from endo3d.schemas import codec, topics
 from endo3d.schemas.messages import Frame, Message
 from endo3d.schemas.topics import Topic
 from endo3d.services.archive.crop import Crop
-from endo3d.services.archive.entry import COMPACT_IMAGE, STACK_FILE, Attachment, Entry, calibration_of
+from endo3d.services.archive.entry import COMPACT_IMAGE, STACK_FILE, Attachment, Entry, entry_of
 from endo3d.services.archive.facts import host_facts
 from endo3d.services.archive.layout import Buffer
 from endo3d.services.archive.reader import Unreadable
 from endo3d.services.archive.recording import Recording
 from endo3d.services.archive.recover import is_whole, recover
 from endo3d.services.archive.spool import Spool
-from endo3d.services.archive.writer import Kind
 from endo3d.services.runtime.errors import UserError
 from endo3d.services.runtime.service import Config, Refused, Sample, Tap
 
@@ -80,7 +79,6 @@ class Recorder(Tap[RecorderConfig]):
 
     def __init__(self, config: RecorderConfig) -> None:
         super().__init__(config)
-        self._kinds = {topic.name: Kind(*codec.schema(topic)) for topic in self.reads}
         self._log_hz = {topic: config.log_hz.get(topic.name, topic.log_hz) for topic in self.reads}
         self._due_ns: dict[str, int] = {}
         self._latched: dict[str, Entry] = {}
@@ -117,7 +115,8 @@ class Recorder(Tap[RecorderConfig]):
             raise UserError(f"can't make the directory {directory}: {error.strerror}; choose another") from error
         if not os.access(directory, os.W_OK | os.X_OK):
             raise UserError(f"can't write into {directory}; set recorder.directory to another")
-        self._repairing = threading.Thread(target=_repair, args=(directory,), name="repair", daemon=True)
+        logs = sorted(directory.glob("*.mcap"))  # now: the one to be recorded is none of them
+        self._repairing = threading.Thread(target=_repair, args=(logs,), name="repair", daemon=True)
         self._repairing.start()
 
     def take(self, sample: Sample) -> Iterator[Message]:
@@ -126,7 +125,7 @@ class Recorder(Tap[RecorderConfig]):
         except codec.Malformed:
             self._lost[f"{sample.topic.name}:malformed"] += 1
             return
-        entry = self._entry(sample, message)
+        entry = entry_of(message, sample.payload, source=sample.source, log_ns=sample.received_ns)
         if self._start_at_next:
             self._autostart(sample.received_ns)
         if self._spool is not None and self._due(entry, sample.topic):
@@ -194,19 +193,6 @@ class Recorder(Tap[RecorderConfig]):
         self._stop()
         if self._repairing is not None:
             self._repairing.join()
-
-    def _entry(self, sample: Sample, message: Message) -> Entry:
-        """Where a sample goes in the log; its payload is still the sender's."""
-        return Entry(
-            channel=sample.topic.channel(sample.source),
-            kind=self._kinds[sample.topic.name],
-            sequence=getattr(message, "sequence", 0),
-            log_ns=sample.received_ns,
-            publish_ns=max(0, message.stamp_ns),  # the format knows no time before 1970
-            payload=(sample.payload,),
-            latched=sample.topic.latched,
-            attachment=calibration_of(message),
-        )
 
     def _put(self, spool: Spool, entry: Entry, sample: Sample, message: Message) -> None:
         """Queue a sample: the received bytes, or those of the image circle alone."""
@@ -311,10 +297,10 @@ def _compactor() -> Callable[[Entry], Entry]:
     return packed
 
 
-def _repair(directory: Path) -> None:
-    """Give every torn log here its index; one that is being recorded, or beyond repair, stays as it is."""
+def _repair(logs: Sequence[Path]) -> None:
+    """Give every torn log its index; one that is being recorded, or beyond repair, stays as it is."""
     os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), 19)  # the recording comes first
-    for path in sorted(directory.glob("*.mcap")):
+    for path in logs:
         try:
             if not is_whole(path):
                 report = recover(path)

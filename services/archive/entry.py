@@ -48,16 +48,22 @@ class Entry:
     """A file that came with it: the calibration."""
 
 
-def entry_of(message: Message) -> Entry:
-    """A message written without a recorder: it arrives when it was made."""
+def entry_of(
+    message: Message, encoded: Buffer | None = None, *, source: str = "", log_ns: int | None = None
+) -> Entry:
+    """A message on its way into a log.
+
+    encoded: its bytes, if they are there already. source: the service that wrote it, for topics written per
+    service. log_ns: when it arrived; by default when it was made.
+    """
     topic = topics.of(message)
     return Entry(
-        channel=topic.channel(),
+        channel=topic.channel(source),
         kind=Kind(*codec.schema(topic)),
         sequence=getattr(message, "sequence", 0),
-        log_ns=message.stamp_ns,
-        publish_ns=message.stamp_ns,
-        payload=(codec.encode(message),),
+        log_ns=message.stamp_ns if log_ns is None else log_ns,
+        publish_ns=max(0, message.stamp_ns),  # the format knows no time before 1970
+        payload=(codec.encode(message) if encoded is None else encoded,),
         latched=topic.latched,
         attachment=calibration_of(message),
     )

@@ -15,11 +15,10 @@ from typing import Any, NamedTuple
 from endo3d.schemas import codec, topics
 from endo3d.schemas.messages import Message
 from endo3d.schemas.topics import Topic
-from endo3d.services.archive.entry import CALIBRATION_FILE, STACK_FILE, Attachment, Entry
+from endo3d.services.archive.entry import CALIBRATION_FILE, STACK_FILE, Attachment, entry_of
 from endo3d.services.archive.facts import host_facts
 from endo3d.services.archive.reader import Log, Record
 from endo3d.services.archive.recording import Recording
-from endo3d.services.archive.writer import Kind
 from endo3d.services.runtime import stack_file
 from endo3d.services.runtime.errors import UserError
 from endo3d.services.runtime.service import Service, Source, Tap
@@ -183,7 +182,7 @@ def replay(
     for record in _read_ahead(log.records(wanted | kept, start_ns=start_ns, end_ns=end_ns)):
         topic = record.stream.topic
         if into is not None and topic in kept:
-            into.put(_entry(topic, "", record.sequence, record.log_ns, record.publish_ns, record.payload))
+            into.put(entry_of(record.message(), record.payload, log_ns=record.log_ns))
         if topic not in wanted:
             continue
         for service, message in pipeline.feed(record.message()):
@@ -207,18 +206,4 @@ def _keep(result: Result, into: Recording | None, digest: Digest | None) -> None
     if digest is not None:
         digest.add(message, encoded)
     if into is not None:
-        sequence = getattr(message, "sequence", 0)
-        topic = topics.of(message)
-        into.put(_entry(topic, result.service, sequence, cause.log_ns, message.stamp_ns, memoryview(encoded)))
-
-
-def _entry(topic: Topic, source: str, sequence: int, log_ns: int, stamp_ns: int, payload: memoryview) -> Entry:
-    return Entry(
-        channel=topic.channel(source),
-        kind=Kind(*codec.schema(topic)),
-        sequence=sequence,
-        log_ns=log_ns,
-        publish_ns=stamp_ns,
-        payload=(payload,),
-        latched=topic.latched,
-    )
+        into.put(entry_of(message, encoded, source=result.service, log_ns=cause.log_ns))
