@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import subprocess
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 
 import pytest
@@ -14,7 +16,7 @@ from rendered import RATE_HZ, STACK, messages, write
 from typer.testing import CliRunner
 
 from endo3d.schemas import codec, topics
-from endo3d.schemas.messages import Cloud, Frame
+from endo3d.schemas.messages import Cloud, Frame, Message
 from endo3d.services.archive.reader import Log
 from endo3d.services.cli.app import app
 from endo3d.services.decoder import Decoder, DecoderConfig
@@ -152,19 +154,27 @@ def test_a_log_without_a_stack_needs_one(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_the_live_stack_computes_the_same_bits(log: Path, tmp_path: Path) -> None:
-    """Processes, shared memory and a clock in between change nothing of the points."""
+    """Processes, shared memory and a clock in between change nothing of the points.
+
+    A busy machine may lose frames on the way to the decoder: every cloud of a whole window is still the same.
+    """
     out = tmp_path / "live.mcap"
-    rig = f"rig.name=replay{os.getpid()}"
-    command = [sys.executable, "-m", "endo3d.services.cli.app", "replay", str(log), "--rate", "0.1"]
-    done = subprocess.run([*command, "--set", rig, "--out", str(out)], capture_output=True, text=True, timeout=240)
+    settings = [f"rig.name=replay{os.getpid()}", "recorder.log_hz={cloud = 180.0}"]
+    command = [sys.executable, "-m", "endo3d.services.cli.app", "replay", str(log), "--rate", "0.02", "--out", str(out)]
+    command += [part for setting in settings for part in ("--set", setting)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
     live = Log(out)
     assert live.count(topics.FRAME) == live.count(topics.TRUTH) == FRAMES
-    clouds = {m.sequence: m for m in live.messages(topics.CLOUD) if isinstance(m, Cloud)}
     recorded = Log(log)
     with engine.stack_of(recorded) as stack, engine.pipeline_of(stack, ["decoder"]) as pipeline:
-        for result in engine.replay(recorded, pipeline):
-            if isinstance(result.message, Cloud) and result.message.sequence in clouds:
-                assert clouds.pop(result.message.sequence).points.tobytes() == result.message.points.tobytes()
-    assert not clouds
-    assert live.count(topics.CLOUD) > 0
+        replayed = points_of(result.message for result in engine.replay(recorded, pipeline))
+    lived = points_of(live.messages(topics.CLOUD))
+    assert lived
+    assert lived == {sequence: replayed[sequence] for sequence in lived}
+
+
+def points_of(messages: Iterable[Message]) -> dict[int, str]:
+    """Frame number -> hash of its cloud's points."""
+    clouds = (message for message in messages if isinstance(message, Cloud))
+    return {cloud.sequence: hashlib.sha256(cloud.points).hexdigest() for cloud in clouds}

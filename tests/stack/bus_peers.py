@@ -71,7 +71,7 @@ class Collector:
     def wait(self, sequence: int) -> None:
         with self._came:
             arrived = self._came.wait_for(
-                lambda: bool(self.sequences) and max(self.sequences) >= sequence, 20
+                lambda: bool(self.sequences) and max(self.sequences) >= sequence, 90
             )
         assert arrived, f"frame {sequence} did not come, only {self.sequences[-3:]}"
 

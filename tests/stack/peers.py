@@ -9,7 +9,7 @@ import uuid
 from collections.abc import Callable
 from typing import Any, Self
 
-_ANSWER_S = 30.0
+_ANSWER_S = 120.0
 
 
 def new_rig() -> str:

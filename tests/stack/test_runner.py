@@ -43,7 +43,7 @@ class Seen:
 
     def wait(self, fits: Callable[[Any], bool]) -> Any:
         with self._came:
-            assert self._came.wait_for(lambda: any(map(fits, self.messages)), 20), "no such message came"
+            assert self._came.wait_for(lambda: any(map(fits, self.messages)), 90), "no such message came"
             return next(filter(fits, self.messages))
 
 
@@ -64,7 +64,7 @@ class Running:
             self.error = error
 
     def join(self) -> None:
-        self._thread.join(20)
+        self._thread.join(90)
         assert not self._thread.is_alive()
 
     def stop(self) -> None:
