@@ -16,6 +16,7 @@ import yaml
 from numpy.typing import ArrayLike, NDArray
 
 from endo3d_core import brown_conrady
+from endo3d_core.bow import NO_BOW, SECTION, Bow
 from endo3d_core.compiled import exact
 
 
@@ -108,6 +109,8 @@ class Rig:
     """(3, 3)."""
     t: NDArray[np.float64]
     """(3,) mm: X_projector = R X_camera + t."""
+    bow: Bow = NO_BOW
+    """What the lenses' model misses by, seen on a flat reference."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "R", np.ascontiguousarray(self.R, np.float64).reshape(3, 3))
@@ -148,7 +151,7 @@ class Rig:
         projector = _section(tree, "projector", lambda value: _lens(value, "projector"))
         R = _section(tree, "R", lambda value: _numbers(value, 9, "R"))
         t = _section(tree, "t", lambda value: _numbers(value, 3, "t"))
-        return cls(camera, projector, R.reshape(3, 3), t)
+        return cls(camera, projector, R.reshape(3, 3), t, Bow.from_tree(tree.get(SECTION)))
 
     def to_yaml(self) -> str:
         """The calibration file's text; ``from_yaml`` gives back the same numbers to the last bit."""
@@ -156,7 +159,11 @@ class Rig:
         for name, lens in (("camera", self.camera), ("projector", self.projector)):
             lines += [f"{name}:", f"  width: {lens.width}", f"  height: {lens.height}"]
             lines += [f"  K: {_text(lens.K)}", f"  dist: {_text(lens.dist)}"]
-        return "\n".join([*lines, f"R: {_text(self.R)}", f"t: {_text(self.t)}", ""])
+        lines += [f"R: {_text(self.R)}", f"t: {_text(self.t)}"]
+        if self.bow.coefficients:
+            lines += [f"{SECTION}:", f"  inverse_depth: {_number(self.bow.inverse_depth)}"]
+            lines += [f"  coefficients: {_text(np.array(self.bow.coefficients))}"]
+        return "\n".join([*lines, ""])
 
 
 def _section(tree: Mapping[str, Any], name: str, parse: Callable[[Any], Any]) -> Any:

@@ -84,13 +84,15 @@ class Board:
 
         Checkerboards and circles are found whole or not at all; ChArUco corners one by one, at least six.
         """
-        match self.kind:
-            case "checkerboard":
-                return self._find_checkerboard(image)
-            case "charuco":
-                return self._find_charuco(image)
-            case _:
-                return self._find_circles(image)
+        find = {"checkerboard": self._find_checkerboard, "charuco": self._find_charuco}.get(
+            self.kind, self._find_circles
+        )
+        for scale in (1, 2, 4):  # grain that is finer than the board hides it from OpenCV
+            size = (image.shape[1] // scale, image.shape[0] // scale)
+            found = find(np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8))
+            if found is not None:
+                return found[0], scale * found[1] + 0.5 * (scale - 1)
+        return None
 
     def _find_checkerboard(self, image: NDArray[np.uint8]) -> Features | None:
         flags = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_NORMALIZE_IMAGE
@@ -99,10 +101,11 @@ class Board:
 
     def _find_circles(self, image: NDArray[np.uint8]) -> Features | None:
         symmetric = self.kind == "circles"
+        blobs = _blob_detector(image.shape)
         flags = cv2.CALIB_CB_SYMMETRIC_GRID if symmetric else cv2.CALIB_CB_ASYMMETRIC_GRID
         for shown in (image, 255 - image):  # dark circles, or bright ones
             found, centres = cv2.findCirclesGrid(
-                shown, (self.columns, self.rows), flags=flags | cv2.CALIB_CB_CLUSTERING
+                shown, (self.columns, self.rows), flags=flags | cv2.CALIB_CB_CLUSTERING, blobDetector=blobs
             )
             if found:
                 return self.points_mm, _pixels(centres)
@@ -141,6 +144,15 @@ class Board:
     def _charuco(self) -> Any:
         dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{self.dictionary}"))
         return cv2.aruco.CharucoBoard((self.columns, self.rows), self.pitch_mm, self.marker_mm, dictionary)
+
+
+def _blob_detector(shape: tuple[int, ...]) -> Any:
+    """OpenCV's own takes no circle larger than 80 px across."""
+    wanted = cv2.SimpleBlobDetector_Params()
+    wanted.minArea, wanted.maxArea = 30.0, shape[0] * shape[1] / 50
+    wanted.minDistBetweenBlobs = 5.0
+    wanted.filterByConvexity, wanted.minConvexity = True, 0.8
+    return cv2.SimpleBlobDetector_create(wanted)
 
 
 @lru_cache(maxsize=2)

@@ -1,8 +1,10 @@
 """Bundle adjustment of camera, projector, their transform and all board poses at once.
 
 Minimises the reprojection error in both images over every parameter, with Huber weights (Triggs et al.,
-Bundle adjustment: a modern synthesis, 2000). The covariance is sigma^2 (J^T W J)^-1 with sigma from the
-residuals, so each parameter comes with its standard deviation.
+Bundle adjustment: a modern synthesis, 2000). The projector's coordinate is read off where the camera found the
+feature, so an error there appears in both images: the four residuals of a feature are weighted by their own
+covariance, estimated from the first solution's. The covariance of the parameters is s^2 (J^T W J)^-1, so each
+comes with its standard deviation.
 """
 
 from __future__ import annotations
@@ -33,6 +35,11 @@ NAMES = (
 
 CAMERA, PROJECTOR, BETWEEN = slice(0, 9), slice(9, 18), slice(18, 24)
 POSE = 6
+PER_FEATURE = 4
+"""Residuals: camera x, y, projector x, y."""
+WHITENINGS = 2
+KEPT = 4.0
+"""Standard deviations within which a residual counts for the covariance."""
 HUBER = 1.345
 """Of a residual in standard deviations: 95 % efficient on normal noise."""
 ITERATIONS = 60
@@ -91,8 +98,12 @@ def solve(
     parameters = _start(sightings, camera_size, projector_size)
     free = np.ones(parameters.size, bool)
     free[[NAMES.index(name) for name in fixed]] = False
-    parameters = _minimise(parameters, free, sightings)
-    residual, J = _linearise(parameters, sightings)
+    whitening = np.eye(PER_FEATURE)
+    for _ in range(WHITENINGS):
+        parameters = _minimise(parameters, free, sightings, whitening)
+        whitening = _whitening(_linearise(parameters, sightings, np.eye(PER_FEATURE))[0])
+    parameters = _minimise(parameters, free, sightings, whitening)
+    residual, J = _linearise(parameters, sightings, whitening)
     weight = _huber(residual)
     J = J[:, free]
     normal = (J.T * weight) @ J
@@ -115,7 +126,7 @@ def solve(
         sigma,
         covariance[:known, :known],
         parameters[len(NAMES) :].reshape(-1, POSE),
-        tuple(_by_sighting(residual, sightings)),
+        _by_sighting(_linearise(parameters, sightings, np.eye(PER_FEATURE))[0], sightings),
     )
 
 
@@ -126,6 +137,15 @@ def rig_of(parameters: Vector, camera_size: Size, projector_size: Size) -> Rig:
         lenses.append(Lens(*size, _K(part), part[4:9]))
     between = parameters[BETWEEN]
     return Rig(lenses[0], lenses[1], _rotation(between[:3]), between[3:])
+
+
+def parameters_of(rig: Rig) -> Vector:
+    """The inverse of ``rig_of``, (24,)."""
+    lenses = [
+        np.array((lens.K[0, 0], lens.K[1, 1], lens.K[0, 2], lens.K[1, 2], *lens.dist))
+        for lens in (rig.camera, rig.projector)
+    ]
+    return np.concatenate((*lenses, _floats(cv2.Rodrigues(rig.R)[0]).ravel(), rig.t))
 
 
 def _start(sightings: list[Sighting], camera_size: Size, projector_size: Size) -> Vector:
@@ -152,10 +172,12 @@ def _start(sightings: list[Sighting], camera_size: Size, projector_size: Size) -
     return np.concatenate((*lenses, cv2.Rodrigues(R)[0].ravel(), t, *camera_poses))
 
 
-def _minimise(parameters: Vector, free: NDArray[np.bool_], sightings: list[Sighting]) -> Vector:
+def _minimise(
+    parameters: Vector, free: NDArray[np.bool_], sightings: list[Sighting], whitening: Matrix
+) -> Vector:
     """Levenberg-Marquardt with Marquardt's scaling, Huber weights renewed in every step."""
     damping = 1e-4
-    residual, J = _linearise(parameters, sightings)
+    residual, J = _linearise(parameters, sightings, whitening)
     cost = _cost(residual)
     for _ in range(ITERATIONS):
         weighted = J[:, free].T * _huber(residual)
@@ -163,7 +185,7 @@ def _minimise(parameters: Vector, free: NDArray[np.bool_], sightings: list[Sight
         step = np.linalg.solve(normal + damping * np.diag(np.diag(normal)), weighted @ residual)
         trial = parameters.copy()
         trial[free] -= step
-        trial_residual, trial_J = _linearise(trial, sightings)
+        trial_residual, trial_J = _linearise(trial, sightings, whitening)
         trial_cost = _cost(trial_residual)
         if trial_cost < cost:
             done = cost - trial_cost < CONVERGED * cost
@@ -195,33 +217,42 @@ def _cost(residual: Vector) -> float:
     return float(np.sum(np.where(size < knee, size**2, 2 * knee * size - knee**2)))
 
 
-def _linearise(parameters: Vector, sightings: list[Sighting]) -> tuple[Vector, Matrix]:
-    """Residuals (predicted - seen), camera then projector per sighting, and their Jacobian."""
-    rows = 4 * sum(len(s.board_mm) for s in sightings)
-    residual, J = np.zeros(rows), np.zeros((rows, parameters.size))
-    at = 0
+def _whitening(residual: Vector) -> Matrix:
+    """(4, 4) that makes a feature's residuals uncorrelated and of variance 1; outliers don't count."""
+    features = residual.reshape(-1, PER_FEATURE)
+    spread = np.maximum(1.4826 * np.median(np.abs(features), axis=0), 1e-12)
+    kept = features[np.all(np.abs(features) < KEPT * spread, axis=1)] / spread
+    covariance = kept.T @ kept / max(len(kept), 1) + 1e-6 * np.eye(PER_FEATURE)
+    return np.asarray(np.linalg.inv(np.linalg.cholesky(covariance)) / spread)
+
+
+def _linearise(parameters: Vector, sightings: list[Sighting], whitening: Matrix) -> tuple[Vector, Matrix]:
+    """Whitened residuals (predicted - seen), per feature camera x, y, projector x, y, and their Jacobian."""
+    features = sum(len(s.board_mm) for s in sightings)
+    residual = np.zeros((features, PER_FEATURE))
+    J = np.zeros((features, PER_FEATURE, parameters.size))
+    between, at = parameters[BETWEEN], 0
     for index, sighting in enumerate(sightings):
-        n = 2 * len(sighting.board_mm)
+        n = len(sighting.board_mm)
         pose = slice(len(NAMES) + POSE * index, len(NAMES) + POSE * (index + 1))
         r, t = parameters[pose][:3], parameters[pose][3:]
-        seen = slice(at, at + n)
+        rows = slice(at, at + n)
         pixels, dpose, dlens = _projection(sighting.board_mm, r, t, parameters[CAMERA])
-        residual[seen] = (pixels - sighting.camera_px).ravel()
-        J[seen, pose], J[seen, CAMERA] = dpose, dlens
+        residual[rows, :2] = pixels - sighting.camera_px
+        J[rows, :2, pose], J[rows, :2, CAMERA] = dpose.reshape(n, 2, -1), dlens.reshape(n, 2, -1)
 
-        lit = slice(at + n, at + 2 * n)
-        between = parameters[BETWEEN]
         r3, t3, *derivatives = cv2.composeRT(r, t, between[:3], between[3:])
         dr3dr1, dr3dt1, dr3dr2, dr3dt2, dt3dr1, dt3dt1, dt3dr2, dt3dt2 = derivatives
         pixels, dpose, dlens = _projection(
             sighting.board_mm, _floats(r3).ravel(), _floats(t3).ravel(), parameters[PROJECTOR]
         )
-        residual[lit] = (pixels - sighting.projector_px).ravel()
-        J[lit, pose] = dpose @ np.block([[dr3dr1, dr3dt1], [dt3dr1, dt3dt1]])
-        J[lit, BETWEEN] = dpose @ np.block([[dr3dr2, dr3dt2], [dt3dr2, dt3dt2]])
-        J[lit, PROJECTOR] = dlens
-        at += 2 * n
-    return residual, J
+        residual[rows, 2:] = pixels - sighting.projector_px
+        by_pose = dpose @ np.block([[dr3dr1, dr3dt1], [dt3dr1, dt3dt1]])
+        by_rig = dpose @ np.block([[dr3dr2, dr3dt2], [dt3dr2, dt3dt2]])
+        J[rows, 2:, pose], J[rows, 2:, BETWEEN] = by_pose.reshape(n, 2, -1), by_rig.reshape(n, 2, -1)
+        J[rows, 2:, PROJECTOR] = dlens.reshape(n, 2, -1)
+        at += n
+    return (residual @ whitening.T).ravel(), np.matmul(whitening, J).reshape(-1, parameters.size)
 
 
 def _projection(board_mm: Matrix, r: Vector, t: Vector, lens: Vector) -> tuple[Matrix, Matrix, Matrix]:
@@ -242,11 +273,6 @@ def _K(lens: Vector) -> Matrix:
     return np.array([[lens[0], 0.0, lens[2]], [0.0, lens[1], lens[3]], [0.0, 0.0, 1.0]])
 
 
-def _by_sighting(residual: Vector, sightings: list[Sighting]) -> list[NDArray[np.float64]]:
-    parts, at = [], 0
-    for sighting in sightings:
-        n = 2 * len(sighting.board_mm)
-        camera, projector = residual[at : at + n].reshape(-1, 2), residual[at + n : at + 2 * n].reshape(-1, 2)
-        parts.append(np.hstack((camera, projector)))
-        at += 2 * n
-    return parts
+def _by_sighting(residual: Vector, sightings: list[Sighting]) -> tuple[NDArray[np.float64], ...]:
+    ends = np.cumsum([len(s.board_mm) for s in sightings])[:-1]
+    return tuple(np.split(residual.reshape(-1, PER_FEATURE), ends))

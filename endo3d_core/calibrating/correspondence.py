@@ -10,8 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
-from endo3d_core.conventional import demodulation, unwrapping_chain
+from endo3d_core.demodulation import demodulation, unwrapping_chain
 from endo3d_core.patterns import Pattern
 
 TWO_PI = 2.0 * math.pi
@@ -19,7 +20,7 @@ TWO_PI = 2.0 * math.pi
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ProjectorMap:
-    """One axis of the projector as the camera sees it; arrays are (height, width) float64."""
+    """One axis of the projector as the camera sees it; arrays have the frames' shape, float64."""
 
     coordinate_px: NDArray[np.float64]
     """Projector pixel along the axis; NaN where the phase is not to be trusted."""
@@ -39,7 +40,7 @@ def projector_map(
     contrast_min: float = 0.1,
     saturation: float = math.inf,
 ) -> ProjectorMap:
-    """frames (patterns, height, width) -> map, by least squares per pixel and heterodyne unwrapping.
+    """frames (patterns, ...) -> map, by least squares per pixel and heterodyne unwrapping.
 
     ``length_px`` is the projector's size along the patterns' axis. Pixels that saturate in any frame, and
     those whose beats disagree by more than a third of a period, are NaN. Raises ``ValueError`` when the
@@ -77,42 +78,40 @@ def projector_map(
 
 
 def sample(
-    map_x: ProjectorMap, map_y: ProjectorMap, pixels: NDArray[np.float64], radius_px: float
+    points: NDArray[np.float64],
+    tree: cKDTree,
+    map_x: ProjectorMap,
+    map_y: ProjectorMap,
+    pixels: NDArray[np.float64],
+    radius_px: float,
 ) -> NDArray[np.float64]:
     """(n, 2) camera pixels -> (n, 2) projector pixels, NaN where too little around is valid.
 
-    In the window around each pixel both coordinates are fitted by a second-order surface, weighted with the
-    squared modulation (the inverse variance of a phase), and outliers are dropped once: a feature lies on an
-    edge of the print, where the pixel itself is the worst witness.
+    ``points`` (m, 2) are where the maps' m values were seen, ``tree`` is of them. Around each pixel both
+    coordinates are fitted by a second-order surface, weighted with the modulation squared (the inverse variance of
+    a phase), and outliers are dropped once: a feature lies on an edge of the print, where the pixel itself is the
+    worst witness.
     """
-    height, width = map_x.coordinate_px.shape
     out = np.full(pixels.shape, np.nan)
-    for i, (u, v) in enumerate(pixels):
-        if not (0 <= u < width and 0 <= v < height):
+    columns = [(m.coordinate_px.ravel(), m.modulation.ravel()) for m in (map_x, map_y)]
+    for i, pixel in enumerate(pixels):
+        if not np.all(np.isfinite(pixel)):
             continue
-        rows = slice(max(0, math.floor(v - radius_px)), min(height, math.ceil(v + radius_px) + 1))
-        columns = slice(max(0, math.floor(u - radius_px)), min(width, math.ceil(u + radius_px) + 1))
-        y, x = np.mgrid[rows, columns]
-        x, y = (x - u) / radius_px, (y - v) / radius_px
-        terms = np.stack((np.ones_like(x), x, y, x * x, x * y, y * y), axis=-1)
-        inside = x * x + y * y <= 1.0
-        for axis, source in enumerate((map_x, map_y)):
-            out[i, axis] = _centre_of_fit(
-                terms, inside, source.coordinate_px[rows, columns], source.modulation[rows, columns]
-            )
+        near = np.asarray(tree.query_ball_point(pixel, radius_px), np.int64)
+        if near.size:
+            x, y = ((points[near] - pixel) / radius_px).T
+            terms = np.stack((np.ones_like(x), x, y, x * x, x * y, y * y), axis=-1)
+            out[i] = [_centre_of_fit(terms, values[near], weight[near]) for values, weight in columns]
     return out
 
 
 def _centre_of_fit(
-    terms: NDArray[np.float64],
-    inside: NDArray[np.bool_],
-    values: NDArray[np.float64],
-    weight: NDArray[np.float64],
+    terms: NDArray[np.float64], values: NDArray[np.float64], weight: NDArray[np.float64]
 ) -> float:
     """The fitted surface's value where all but the constant term vanish."""
-    use = inside & np.isfinite(values)
+    use = np.isfinite(values)
     for _ in range(2):
-        if use.sum() < 2 * terms.shape[-1] or use.sum() < inside.sum() / 3:
+        if use.sum() < 2 * terms.shape[-1] or use.sum() < len(values) / 3:
             return math.nan
         A, b, w = terms[use], values[use], weight[use]
         solution = np.linalg.lstsq(A * w[:, None], b * w, rcond=None)[0]

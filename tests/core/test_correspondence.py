@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from endo3d_core import patterns
 from endo3d_core.calibrating.correspondence import ProjectorMap, projector_map, sample
@@ -81,7 +82,8 @@ def test_a_feature_on_a_printed_edge_is_sampled_from_both_sides() -> None:
     wild[28, 41] += 500
     dirty = ProjectorMap(wild, found.contrast, found.modulation, found.white)
     at = np.array([[40.3, 30.6], [1000.0, 10.0]])
-    sampled = sample(dirty, found, at, 8.0)
+    points = np.stack((u.ravel(), v.ravel()), axis=-1).astype(np.float64)
+    sampled = sample(points, cKDTree(points), dirty, found, at, 8.0)
     expected = 20.0 + 11.3 * 40.3 + 0.4 * 30.6 + 0.002 * 40.3 * 30.6
     np.testing.assert_allclose(sampled[0], expected, atol=0.03)
     assert np.all(np.isnan(sampled[1]))
