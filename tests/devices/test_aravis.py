@@ -13,7 +13,7 @@ from endo3d.services.devices.aravis_camera import AravisCamera, library
 from endo3d.services.devices.camera import open_camera
 from endo3d.services.devices.uri import DeviceError, Setting
 
-WAIT_S = 20.0
+WAIT_S = 60.0
 
 
 @pytest.fixture(scope="module", autouse=True)

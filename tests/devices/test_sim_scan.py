@@ -50,7 +50,7 @@ class Stack:
                 reply.update(out)  # type: ignore[arg-type]
         return reply
 
-    def until(self, frames: int, within_s: float = 20.0) -> None:
+    def until(self, frames: int, within_s: float = 120.0) -> None:
         """Run until so many frames have come in all."""
         deadline_s = time.monotonic() + within_s
         while len(self.frames) < frames and time.monotonic() < deadline_s:

@@ -158,11 +158,14 @@ def test_a_tap_gets_what_travels_undecoded(outside: Bus, rig: str) -> None:
 
 
 def test_newest_only_reads_skip_without_a_loss(outside: Bus, rig: str) -> None:
+    stepping, release = threading.Event(), threading.Event()
+
     class Viewer(Halver):
         newest = (topics.FRAME,)
 
         def step(self, message: Message) -> Iterator[Message]:
-            time.sleep(0.05)
+            stepping.set()
+            assert release.wait(90)
             yield from super().step(message)
 
     depths = watch(outside, topics.DEPTH)
@@ -171,10 +174,11 @@ def test_newest_only_reads_skip_without_a_loss(outside: Bus, rig: str) -> None:
         wait_for(outside, "viewer")
         for sequence in range(60):
             outside.publish(frame(outside, sequence, (24, 32)))
-            time.sleep(0.003)
+            assert stepping.wait(90)  # on the first of them, until all are sent
+        release.set()
         depths.wait(lambda depth: depth.sequence == 59)
         run.stop()
-        assert len(depths.messages) < 30
+        assert len(depths.messages) < 60
         assert bus.tally.dropped == {}
 
 
@@ -191,18 +195,14 @@ def test_a_source_that_ends_ends_its_process_with_zero(rig: str) -> None:
 # ---------------------------------------------------------------- commands
 
 
-def test_commands_reach_a_busy_source_at_once(outside: Bus, rig: str) -> None:
+def test_commands_reach_a_busy_source(outside: Bus, rig: str) -> None:
     modes = watch(outside, topics.MODE)
     with running(Ticker(Config()), rig, "ticker"):
         assert outside.call("ticker", "mode", {"name": "conventional"}) == {"epoch": 1}
         mode: Mode = modes.wait(lambda message: message.mode == "conventional")
         assert mode.running
-        took_s = []
-        for _ in range(20):
-            began_s = time.monotonic()
-            outside.call("ticker", "count")
-            took_s.append(time.monotonic() - began_s)
-        assert sorted(took_s)[10] < 0.1
+        for _ in range(20):  # none of them may starve beside a source that never rests
+            outside.call("ticker", "count", timeout_s=90)
         with pytest.raises(Refused, match="say which"):
             outside.call("ticker", "mode")
         with pytest.raises(Refused, match="no command 'dance'; this service knows: count, mode"):

@@ -67,7 +67,7 @@ def test_a_slow_loop_gets_the_newest() -> None:
         frames.close()  # type: ignore[attr-defined]
     assert isinstance(first, Frame)
     assert isinstance(second, Frame)
-    assert second.sequence > first.sequence + 10
+    assert second.sequence > first.sequence + 1, "it was asleep while others came"
 
 
 def test_a_tap_on_nothing_ends_after_its_timeout() -> None:
