@@ -11,6 +11,7 @@ import json
 import logging
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
@@ -25,6 +26,7 @@ from endo3d.schemas.topics import Topic
 from endo3d.services.lanes.clock import Exchange, Offset
 from endo3d.services.lanes.incoming import Incoming, Ordered
 from endo3d.services.lanes.outgoing import (
+    LARGE,
     PACKED,
     Changes,
     Every,
@@ -36,7 +38,7 @@ from endo3d.services.lanes.outgoing import (
 )
 from endo3d.services.lanes.shards import PIECE_FRAMES, Shares
 from endo3d.services.runtime import graph, hosts, stack_file
-from endo3d.services.runtime.access import clock_key, lane_key
+from endo3d.services.runtime.access import TAKEN, clock_key, lane_key
 from endo3d.services.runtime.errors import UserError
 from endo3d.services.runtime.hosts import RELAY, Lane, Role
 from endo3d.services.runtime.identity import Identity, identity_of
@@ -85,6 +87,8 @@ class Relay(Gateway[RelayConfig]):
         """Name of a service -> its host, of all the others."""
         writers = {topic.name: entry.name for entry in wiring.entries for topic in entry.kind.writes}
         self._writers = writers
+        self._seen: deque[tuple[str, bool]] = deque()
+        """Who came or went, on this host or another."""
         self._there: set[str] = set()
         self._alive_here: set[str] = set()
         self._offset = Offset()
@@ -172,6 +176,8 @@ class Relay(Gateway[RelayConfig]):
             if lane.receiver == self.config.host:
                 for topic in lane.topics:
                     self._receive(line, lane, topic)
+            if lane.sender == self.config.host:
+                line.listen(lane_key(rig, lane.receiver, lane.sender, TAKEN), partial(self._hear_taken, lane.receiver))
         if self.role is not Role.VIEWER:
             for name in self.here:
                 line.answer(topics.control_key(rig, name, "*"), self._command_here)
@@ -190,6 +196,9 @@ class Relay(Gateway[RelayConfig]):
         name = self._name_on_lane(lane, topic)
         speaks_for = frozenset(self.placement.on(lane.sender).values())
         incoming = Incoming(topic, publish, self._tally, speaks_for=speaks_for, packed=name == PACKED)
+        if topic in LARGE:
+            say = line.sender(lane_key(self.config.rig, lane.receiver, lane.sender, TAKEN), large=False)
+            incoming.taken = partial(say, topic.name.encode())
         key = lane_key(self.config.rig, lane.sender, lane.receiver, name)
         line.receive(key, replace(topic, latched=False), incoming.take, self._tally)
 
@@ -204,7 +213,8 @@ class Relay(Gateway[RelayConfig]):
     def _sender(self, lane: Lane, topic: Topic, line: Line) -> Sender:
         assert self._bus is not None
         preview = self.placement.hosts[lane.receiver].preview
-        put = line.sender(lane_key(self.config.rig, lane.sender, lane.receiver, self._name_on_lane(lane, topic)), topic)
+        key = lane_key(self.config.rig, lane.sender, lane.receiver, self._name_on_lane(lane, topic))
+        put = line.sender(key, large=topic in LARGE)
         newest_hz = None
         if topic.per_service:
             sender = Sender(topic, Every(topic.depth, self._report), put)
@@ -219,6 +229,11 @@ class Relay(Gateway[RelayConfig]):
             sender = Sender(topic, Every(topic.depth, whole), put)
         self._bus.subscribe_encoded(topic, sender.add, newest_hz=newest_hz)
         return sender
+
+    def _hear_taken(self, host: str, topic: bytes) -> None:
+        for sender in self._senders.get(host, ()):
+            if sender.topic.name.encode() == topic:
+                sender.taken()
 
     def _name_on_lane(self, lane: Lane, topic: Topic) -> str:
         reduced = self.placement.hosts[lane.receiver].preview is not None and not lane.shared
@@ -275,17 +290,32 @@ class Relay(Gateway[RelayConfig]):
     # ---------------------------------------------------------------- who is there
 
     def _see_here(self, service: str, there: bool) -> None:
-        if service not in self.here:
-            return
+        if service in self.here:
+            self._seen.append((service, there))
+
+    def _see_there(self, key: str, there: bool) -> None:
+        service = key.rpartition("/")[2]
+        if service in self.elsewhere:
+            self._seen.append((service, there))
+
+    def _pass_on(self, service: str, there: bool) -> None:
+        """Who is here is shown there, and the other way round.
+
+        Not from within zenoh's callbacks: a line that is held up would hold up this host's own mesh.
+        """
+        if service in self.here:
+            self._show(service, there)
+        else:
+            self._mirror(service, there)
+
+    def _show(self, service: str, there: bool) -> None:
         (self._alive_here.add if there else self._alive_here.discard)(service)
         line, key = self._lines[0] if self._lines else None, topics.alive_key(self.config.rig, service)
         if line is not None and line.up:
             (line.show if there else line.hide)(key)
 
-    def _see_there(self, key: str, there: bool) -> None:
-        service = key.rpartition("/")[2]
-        if service not in self.elsewhere or self._bus is None:
-            return
+    def _mirror(self, service: str, there: bool) -> None:
+        assert self._bus is not None
         (self._there.add if there else self._there.discard)(service)
         (self._bus.declare_alive if there else self._bus.undeclare_alive)(service)
         if there and service == f"{RELAY}-{self.elsewhere[service]}":
@@ -296,6 +326,8 @@ class Relay(Gateway[RelayConfig]):
     def _attend(self) -> None:
         ping_at_s = 0.0
         while not self._closing.wait(_TICK_S):
+            while self._seen:
+                self._pass_on(*self._seen.popleft())
             for ordered in tuple(self._ordered.values()):
                 ordered.attend()
             if time.monotonic() >= ping_at_s:

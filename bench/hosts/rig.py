@@ -81,7 +81,8 @@ class Hosts:
         self._topics = topics
         self._folder = folder
         router = load(stack).placement.router
-        shared = [f"rig.port={PORT}", f"rig.keys={folder / 'keys'}", f"hosts.{router}.address={network.address[router]}"]
+        shared = [f"rig.port={PORT}", f"rig.keys={folder / 'keys'}"]
+        shared.append(f"hosts.{router}.address={network.address[router]}")
         self.stack = load(stack, [*shared, *settings])
         self._file = folder / "stack.toml"
         self._file.write_text(self.stack.toml)

@@ -27,7 +27,7 @@ class SteadyConfig(Config):
 
 
 class Steady(Source[SteadyConfig]):
-    """Publishes by a schedule; when it was held up it catches up, so what is missing at the end was held up for good."""
+    """Publishes by a schedule, and catches up when it was held up: what is missing at the end was held up for good."""
 
     Config = SteadyConfig
     writes = (topics.FRAME, topics.CLOUD, topics.POSE, topics.MAP, topics.MODE)

@@ -24,13 +24,15 @@ EVERY_S = 0.25
 
 
 class Tally:
-    """Counts, the newest sequence and the longest silence, per topic."""
+    """Per topic: how many, up to which sequence, how many sequences were left out, how old when they came."""
 
     def __init__(self) -> None:
         self.counts: Counter[str] = Counter()
         self.newest: dict[str, int] = {}
         self.backwards: Counter[str] = Counter()
         self.age_ms: dict[str, float] = {}
+        self.stamps_s: dict[str, float] = {}
+        self.skipped: Counter[str] = Counter()
         self.voxels: set[bytes] = set()
         self.statuses: dict[str, Status] = {}
         self.lock = threading.Lock()
@@ -43,8 +45,11 @@ class Tally:
                 return
             self.counts[name] += 1
             sequence = getattr(message, "sequence", self.counts[name])
-            self.backwards[name] += sequence <= self.newest.get(name, -1)
+            before = self.newest.get(name, sequence - 1)
+            self.backwards[name] += sequence <= before
+            self.skipped[name] += max(0, sequence - before - 1)
             self.newest[name] = sequence
+            self.stamps_s[name] = 1e-9 * message.stamp_ns
             self.age_ms[name] = 1e-6 * (time.time_ns() - message.stamp_ns)
             if isinstance(message, MapDelta):
                 keys = np.stack([message.points[key] for key in ("kx", "ky", "kz")], axis=-1).astype(np.int16)
@@ -57,9 +62,11 @@ class Tally:
             return {
                 "s": time.monotonic(),
                 "counts": dict(self.counts),
-                "newest": self.newest,
+                "newest": dict(self.newest),
+                "stamps_s": dict(self.stamps_s),
+                "skipped": dict(self.skipped),
                 "backwards": dict(self.backwards),
-                "age_ms": self.age_ms,
+                "age_ms": dict(self.age_ms),
                 "voxels": len(self.voxels),
                 "services": {
                     name: {

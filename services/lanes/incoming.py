@@ -28,6 +28,8 @@ class Incoming:
         packed: bool = False,
     ) -> None:
         """speaks_for: the services of that host; packed: frames hold JPEG files."""
+        self.taken: Callable[[], object] = bool
+        """Told of each message, when it has been taken."""
         self._topic = topic
         self._publish = publish
         self._tally = tally
@@ -36,6 +38,12 @@ class Incoming:
 
     def take(self, sample: Sample) -> None:
         """Publishes a sample here; what is malformed, or of a service of another host, is counted."""
+        try:
+            self._take(sample)
+        finally:
+            self.taken()
+
+    def _take(self, sample: Sample) -> None:
         try:
             message = codec.decode(self._topic, sample.payload)
             if self._packed and isinstance(message, Frame):

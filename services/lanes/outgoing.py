@@ -1,6 +1,8 @@
 """The way out: what of a topic crosses to another host, in what form, and where it waits for the link.
 
 It waits in plain memory, never in the rig's shared memory: a link that is slow, or cut, costs the rig nothing.
+And it waits here, not in the router, which would make others wait: of a large topic the far host has to have
+taken a message before the next but one is sent.
 """
 
 from __future__ import annotations
@@ -20,8 +22,15 @@ from endo3d.services.lanes.shards import Shares
 from endo3d.services.runtime.hosts import Preview
 from endo3d.services.runtime.service import Sample
 
+LARGE: Final = (topics.FRAME, topics.CLOUD, topics.DEPTH, topics.MAP)
 PACKED: Final = "frame.jpeg"
 """Last part of the key of frames that hold a JPEG file: no picture until the far end unpacks them."""
+
+
+UNDER_WAY: Final = 2
+"""Messages of a large topic that may be on their way: one is sent while the other is unpacked."""
+FORGOTTEN_S: Final = 2.0
+"""A message of which nothing is heard for so long is lost."""
 
 
 class Waiting(Protocol):
@@ -120,6 +129,7 @@ class Sender(threading.Thread):
         self._put = put
         self._period_s = 1.0 / rate_hz
         self._last: bytes | None = None
+        self._under_way = 0
         self._again = False
         self._closing = False
         self._changed = threading.Condition()
@@ -137,13 +147,22 @@ class Sender(threading.Thread):
                 self._again = True
                 self._changed.notify()
 
+    def taken(self) -> None:
+        """The far host has taken a message."""
+        with self._changed:
+            self._under_way = max(0, self._under_way - 1)
+            self._changed.notify()
+
     def run(self) -> None:
         while True:
             with self._changed:
                 self._changed.wait_for(lambda: self._closing or self._again or self.waiting.ready())
+                if not self._changed.wait_for(lambda: self._closing or self._under_way < UNDER_WAY, FORGOTTEN_S):
+                    self._under_way = 0
                 if self._closing:
                     return
                 again, self._again = self._again, False
+                self._under_way += self.topic in LARGE
             began_s = time.monotonic()
             payload = self.waiting.take() or (self._last if again else None)
             if payload is not None:

@@ -3,6 +3,7 @@
 Keys between hosts, all below ``endo3d/<rig>/``:
 
     lane/<from>/<to>/<topic>       what a host's services wrote, for another host
+    lane/<from>/<to>/taken         the name of the topic of which it has taken a message
     control/<service>/<verb>       commands
     alive/<service>                who is there
     clock/<host>                   what time it is there
@@ -11,10 +12,13 @@ Keys between hosts, all below ``endo3d/<rig>/``:
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Final
 
 from endo3d.schemas import topics
 from endo3d.services.runtime.hosts import Placement, Role, common_name
+
+TAKEN: Final = "taken"
+"""Last part of the key on which a host says that it has taken a large message."""
 
 
 def lane_key(rig: str, sender: str, receiver: str, rest: str) -> str:
@@ -46,6 +50,7 @@ def _rules(rig: str, placement: Placement, host: str, role: Role) -> list[dict[s
     """Of one host; ``ingress`` is what it sends, ``egress`` what it is sent."""
     lane_in = lane_key(rig, "*", host, "**")
     reports = [lane_key(rig, host, "*", topic.name) for topic in topics.TOPICS if topic.per_service]
+    reports.append(lane_key(rig, host, "*", TAKEN))
     alive, clock = topics.alive_key(rig, "*"), clock_key(rig, "*")
     instances = placement.on(host).values()
     own_alive = [topics.alive_key(rig, name) for name in instances]

@@ -7,6 +7,8 @@ would not say so, the frames would just never come.
 
 from __future__ import annotations
 
+import contextlib
+import threading
 from collections.abc import Callable
 
 import zenoh
@@ -37,10 +39,14 @@ def map_offered(session: zenoh.Session, key: str, fail: Callable[[], None]) -> z
     """Map the pools that are offered, now and from now on; ``fail`` is called when that can't be."""
 
     def take(token: zenoh.Sample) -> None:
-        if token.kind != zenoh.SampleKind.PUT or any(_ask(session, key) for _ in range(_TIMES)):
-            return
-        if _is_offered(session, key):
-            fail()
+        # Not in zenoh's own thread: it has two for all that comes in, the answers too.
+        if token.kind == zenoh.SampleKind.PUT:
+            threading.Thread(target=map_it, name="map", daemon=True).start()
+
+    def map_it() -> None:
+        with contextlib.suppress(zenoh.ZError):  # the session is closed
+            if not any(_ask(session, key) for _ in range(_TIMES)) and _is_offered(session, key):
+                fail()
 
     _ask(session, key)
     return session.liveliness().declare_subscriber(key, take, history=True)

@@ -12,7 +12,6 @@ from typing import Any, Final
 import zenoh
 from zenoh.handlers import FifoChannel
 
-from endo3d.schemas import topics
 from endo3d.schemas.topics import Topic
 from endo3d.services.runtime.access import access_control
 from endo3d.services.runtime.errors import UserError
@@ -28,12 +27,10 @@ _LEASE_MS: Final = 2_000
 """Silence after which a link counts as cut."""
 _SOCKET_BYTES: Final = 256 << 10
 """40 ms of a link of 100 Mbit/s, doubled by the system; still 10 MB/s over a way of 50 ms."""
-_PATIENCE_US: Final = 30_000_000
+_EGRESS_US: Final = 500_000
+"""How long the router lets a large message wait for a link: it forwards for others in the same two threads."""
 _AGAIN_S: Final = 0.5
 _SEQUENCE_MASK: Final = 0xFFFF_FFFF
-
-_LARGE: Final = (topics.FRAME, topics.CLOUD, topics.DEPTH, topics.MAP)
-"""What is small overtakes these; among themselves they take turns."""
 
 _COMMON: Final[Mapping[str, Any]] = {
     "scouting/multicast/enabled": False,
@@ -46,8 +43,8 @@ _COMMON: Final[Mapping[str, Any]] = {
     # What waits for a slow link should wait where it can still be overtaken, or be replaced by what is newer.
     "transport/link/tls/so_sndbuf": _SOCKET_BYTES,
     "transport/link/tls/so_rcvbuf": _SOCKET_BYTES,
-    # A large message may have to wait that long for small ones on a thin link; a dead link is cut by its lease.
-    "transport/link/tx/queue/congestion_control/block/wait_before_close": _PATIENCE_US,
+    "transport/link/tx/queue/size/data_high": 16,
+    "transport/link/tx/queue/size/data": 16,
     "adminspace/enabled": False,
 }
 
@@ -59,6 +56,18 @@ def router_settings(rig: str, placement: Placement, identity: Identity) -> dict[
         "listen/endpoints": [placement.endpoint],
         **_COMMON,
         **identity.listening(),
+        # A router that waits for one host waits for all. Large messages are held back by their sender instead.
+        "qos/network": [
+            {
+                "id": "never wait",
+                "messages": ["put"],
+                "flows": ["egress"],
+                "key_exprs": [f"endo3d/{rig}/lane/**"],
+                "overwrite": {"congestion_control": "drop"},
+            }
+        ],
+        "transport/link/tx/queue/congestion_control/drop/wait_before_drop": _EGRESS_US // 5,
+        "transport/link/tx/queue/congestion_control/drop/max_wait_before_drop_fragments": _EGRESS_US,
         "access_control": access_control(rig, placement),
     }
 
@@ -140,12 +149,12 @@ class Line(threading.Thread):
         """Whether the router is there now."""
         return self._session is not None and bool(self._session.info.routers_zid())
 
-    def sender(self, key: str, topic: Topic) -> Callable[[bytes], None]:
-        """What puts samples on ``key``, numbered; it waits while the link is slower, and loses them while it is cut."""
+    def sender(self, key: str, *, large: bool) -> Callable[[bytes], None]:
+        """What puts samples on ``key``, numbered. Lost while the link is cut; what is large also when it is slow."""
         publisher = self._there().declare_publisher(
             key,
             congestion_control=zenoh.CongestionControl.BLOCK,
-            priority=zenoh.Priority.DATA if topic in _LARGE else zenoh.Priority.DATA_HIGH,
+            priority=zenoh.Priority.DATA if large else zenoh.Priority.DATA_HIGH,  # small ones overtake
             express=True,
         )
         self._declared.append(publisher)
@@ -153,10 +162,15 @@ class Line(threading.Thread):
 
         def put(payload: bytes) -> None:
             nonlocal sequence
-            publisher.put(payload, source_info=zenoh.SourceInfo(publisher.id, sequence))
+            with contextlib.suppress(zenoh.ZError):  # closing
+                publisher.put(payload, source_info=zenoh.SourceInfo(publisher.id, sequence))
             sequence = (sequence + 1) & _SEQUENCE_MASK
 
         return put
+
+    def listen(self, key: str, take: Callable[[bytes], None]) -> None:
+        """Call ``take`` with what is put on ``key``: something small, and quickly done with."""
+        self._declared.append(self._there().declare_subscriber(key, lambda sample: take(sample.payload.to_bytes())))
 
     def receive(self, key: str, topic: Topic, deliver: Callable[[Sample], None], tally: Tally) -> None:
         """Call ``deliver`` with what comes on ``key``, in a thread of its own."""
