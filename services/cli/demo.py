@@ -28,6 +28,16 @@ PATIENCE_S = 8.0
 """A start that takes longer is explained, and so often again where nothing can be drawn."""
 START_LIMIT_S = 300.0
 """Compiling every kernel for the first time takes a while."""
+TRIAL_S = 3.0
+MISSED_MAX = 0.03
+"""A scan that misses more of its triggers in its first seconds begins again at a slower rate."""
+
+
+class TooFast(Exception):
+    """This machine can't hold the rate."""
+
+    def __init__(self, missed_share: float) -> None:
+        super().__init__(f"{100 * missed_share:.0f} % of the triggers were missed")
 
 
 def demo(
@@ -50,13 +60,8 @@ def demo(
     folder = out or Path("out") / f"demo-{datetime.now(UTC):%Y%m%d-%H%M%S}"
     folder.mkdir(parents=True, exist_ok=True)
     settings = [*_recording(folder), *(overrides or ())]
-    pace = _pace(stack, settings)
-    if pace is not None:
-        settings = [*pace.overrides(), *settings]
-        if not as_json:
-            print(pace.describe(), file=sys.stderr)
-    figures = scan(stack, settings, seconds, quiet=as_json)
-    report = write(folder, {**figures, "render_ms": pace.render_ms if pace else None})
+    figures = _scan_at_its_pace(folder, stack, settings, seconds, as_json)
+    report = write(folder, figures)
     if as_json:
         print(json.dumps(report, indent=2))
     else:
@@ -78,8 +83,32 @@ def _pace(stack: str, settings: list[str]) -> Pace | None:
     return measure(stack_file.load(stack, settings))
 
 
-def scan(stack: str, overrides: list[str], seconds: float, quiet: bool) -> dict[str, Any]:
-    """Run the stack for ``seconds`` from its first cloud on; what was measured while it ran."""
+def _scan_at_its_pace(folder: Path, stack: str, settings: list[str], seconds: float, quiet: bool) -> dict[str, Any]:
+    """``scan`` at the fastest rate that this machine holds."""
+    before = set(folder.iterdir())
+    pace = _pace(stack, settings)
+    if pace is None:
+        return {**scan(stack, settings, seconds, quiet), "render_ms": None}
+    if not quiet:
+        print(pace.describe(), file=sys.stderr)
+    while (slower := pace.slower()) is not None:
+        try:
+            figures = scan(stack, [*pace.overrides(), *settings], seconds, quiet, on_trial=True)
+            return {**figures, "render_ms": pace.render_ms}
+        except TooFast as too_fast:
+            for file in set(folder.iterdir()) - before:
+                file.unlink()
+            pace = slower
+            if not quiet:
+                print(f"{too_fast}: once more, at {pace.rate_hz:g} Hz.", file=sys.stderr)
+    return {**scan(stack, [*pace.overrides(), *settings], seconds, quiet), "render_ms": pace.render_ms}
+
+
+def scan(stack: str, overrides: list[str], seconds: float, quiet: bool, *, on_trial: bool = False) -> dict[str, Any]:
+    """Run the stack for ``seconds`` from its first cloud on; what was measured while it ran.
+
+    ``on_trial``: raises ``TooFast`` when its first seconds miss too many triggers.
+    """
     from endo3d.services.cli.up import Asked
     from endo3d.services.cli.watch import Watch, percentiles_ms
     from endo3d.services.runtime import graph, stack_file
@@ -100,7 +129,7 @@ def scan(stack: str, overrides: list[str], seconds: float, quiet: bool) -> dict[
             lines.progress = progress
             launcher.start()
             _await_first_cloud(launcher, watch, asked, described, progress, began_s)
-            scanned_s = _scan(launcher, watch, asked, described, progress, seconds)
+            scanned_s = _scan(launcher, watch, asked, progress, seconds, on_trial)
             progress.update(progress.add_task("closing the archive", total=None))
             launcher.stop(hurry=lambda: asked.times > 1)
         if launcher.user_error:
@@ -172,13 +201,18 @@ def _turn_or_give_up(launcher: Launcher, began_s: float) -> None:
         raise UserError(f"no cloud after {START_LIMIT_S:.0f} s; endo3d doctor checks this machine")
 
 
-def _scan(launcher: Launcher, watch: Watch, asked: Asked, stack: Stack, progress: Progress, seconds: float) -> float:
-    """Until the time is over, somebody asks, or the stack is done; seconds scanned."""
+def _scan(launcher: Launcher, watch: Watch, asked: Asked, progress: Progress, seconds: float, on_trial: bool) -> float:
+    """Until the time is over, somebody asks, or the stack is done; seconds scanned. Raises ``TooFast``."""
     task = progress.add_task("scanning", total=seconds)
-    began_s = time.monotonic()
+    began_s, before = time.monotonic(), watch.triggers("grabber")
     while (spent_s := time.monotonic() - began_s) < seconds and not (launcher.done or asked.times):
         launcher.turn(0.1)
         what = f"scanning: {watch.clouds} clouds at {watch.rate_hz('decoder'):.0f} Hz, {watch.tracking}"
         progress.update(task, completed=spent_s, description=what)
+        if on_trial and spent_s > TRIAL_S:
+            on_trial = False
+            if (missed_share := watch.triggers("grabber").missed_share(before)) > MISSED_MAX:
+                launcher.stop(hurry=lambda: asked.times > 0)
+                raise TooFast(missed_share)
     progress.remove_task(task)
     return spent_s

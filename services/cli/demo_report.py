@@ -44,6 +44,7 @@ def write(folder: Path, figures: dict[str, Any]) -> dict[str, Any]:
         "slow_motion": scan.truths[-1].slow_motion if scan.truths else 1.0,
         "frames": sum(log.count(topics.FRAME) for log in logs),
         "rate_hz": (scan.frames - 1) / scan.seconds if scan.seconds else 0.0,
+        "missed_triggers": _missed_triggers(scan),
         "poses": len(scan.poses),
         "map_points": len(points),
         "merging_distance_mm": scan.merged.merging_distance_mm,
@@ -58,6 +59,12 @@ def write(folder: Path, figures: dict[str, Any]) -> dict[str, Any]:
 def _messages(logs: list[Log]) -> Iterator[Message]:
     """Of all parts: a recorder that was restarted goes on in a new file."""
     return chain.from_iterable(log.messages() for log in logs)
+
+
+def _missed_triggers(scan: Scan) -> int:
+    """Of a simulated camera, from the first pose on: what came before belongs to the start."""
+    numbers = [truth.sequence for truth in scan.truths if scan.poses and truth.stamp_ns >= scan.poses[0].stamp_ns]
+    return numbers[-1] - numbers[0] + 1 - len(numbers) if numbers else 0
 
 
 def _picture(scan: Scan, path: Path, comparison: Comparison | None) -> None:
@@ -84,6 +91,9 @@ def show(report: dict[str, Any]) -> None:
     table.add_row("first cloud", f"{report['start_s']:.1f} s after the command")
     render = f"; rendering took {report['render_ms']:.0f} ms each at the start" if report["render_ms"] else ""
     table.add_row("frames", f"{report['frames']} at {report['rate_hz']:.1f} Hz{slow}{render}")
+    if missed := report["missed_triggers"]:
+        share = 100 * missed / (missed + report["frames"])
+        table.add_row("missed", f"{missed} triggers ({share:.1f} %): this machine was too busy for the rate")
     table.add_row("lost", _lost(report["lost"]))
     for name, key in (("exposure to cloud", "latency_cloud_ms"), ("exposure to pose", "latency_pose_ms")):
         table.add_row(name, f"p50 {report[key]['p50']:.1f} ms, p99 {report[key]['p99']:.1f} ms")

@@ -4,12 +4,26 @@ from __future__ import annotations
 
 import threading
 import time
+from dataclasses import dataclass
 
 import numpy as np
 
 from endo3d.schemas import topics
 from endo3d.schemas.messages import Cloud, Message, Pose, ServiceState, Status
 from endo3d.services.runtime.bus import Bus
+
+
+@dataclass(frozen=True)
+class Triggers:
+    """What a camera made of them, since its start."""
+
+    taken: int = 0
+    missed: int = 0
+
+    def missed_share(self, before: Triggers) -> float:
+        """Since ``before``; 0 of none."""
+        missed = self.missed - before.missed
+        return missed / max(1, missed + self.taken - before.taken)
 
 
 class Watch:
@@ -61,6 +75,13 @@ class Watch:
         return [
             name for name in services if name not in self.statuses or self.statuses[name].state is ServiceState.STARTING
         ]
+
+    def triggers(self, service: str) -> Triggers:
+        """As the service that takes the frames last said."""
+        if service not in self.statuses:
+            return Triggers()
+        status = self.statuses[service]
+        return Triggers(status.published.get(topics.FRAME.name, 0), status.dropped.get("trigger:missed", 0))
 
     def rate_hz(self, service: str) -> float:
         return self.statuses[service].rate_hz if service in self.statuses else 0.0

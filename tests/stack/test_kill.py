@@ -80,7 +80,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def stack(folder: Path) -> Iterator[Stack]:
     settings = [f"rig.name=faults{os.getpid()}", f"recorder.directory={folder}", "recorder.name=scan"]
-    settings += ["viewer.show=none", f"viewer.save={folder / 'scan.rrd'}", "sequencer.rate_hz=15"]
+    # A busy machine has to start a service while it holds this rate.
+    settings += ["viewer.show=none", f"viewer.save={folder / 'scan.rrd'}", "sequencer.rate_hz=5"]
+    settings += ["grabber.camera=sim:contour texture=noise:0.15:0.15?motion=hand seed=7&bin=4&slow_motion=34.4"]
     described = stack_file.load("demo", settings)
     assert {"sequencer", "grabber", "decoder", "odometry", "recorder", "viewer"} == set(described.tables)
     with (
@@ -117,7 +119,7 @@ def test_the_archive_is_whole_and_nothing_is_left_running(stack: Stack, folder: 
     logs = sorted((Log(path) for path in folder.glob("*.mcap")), key=lambda log: log.start_ns)
     assert len(logs) == 2, "one until the recorder was killed, one from then on"
     stamps_ns = [frame.stamp_ns for log in logs for frame in log.messages(topics.FRAME)]
-    assert len(stamps_ns) == len(set(stamps_ns)) > 100
+    assert len(stamps_ns) == len(set(stamps_ns)) > 30
     for log in logs:
         assert {"stack.toml", "calibration.yaml"} <= set(log.attachments)
         recorded = [
