@@ -63,6 +63,12 @@ class LiveView:
         """1-sigma of a normal's tilt from this one cloud."""
         return math.sqrt(normals.SLOPE_VARIANCE) * self.sigma_mm / self.pitch_mm
 
+    @property
+    def texture_noise(self) -> float:
+        """1-sigma of a cell's texture, from second differences along and across: edges of the part run one way."""
+        texture = self.live[pooling.TEXTURE]
+        return 1.4826 / math.sqrt(6.0) * min(typical_bend(texture), typical_bend(texture.T))
+
     def points(self) -> NDArray[np.float64]:
         """(n, 3) float64 valid pooled points, mm in the camera's axes."""
         xyz = self.live[: pooling.Z + 1].reshape(3, -1)
@@ -97,3 +103,15 @@ def typical(plane: NDArray[np.float32], otherwise: float, stride: int = 8) -> fl
             values[n] = plane[r, c]
             n += 1 if values[n] == values[n] else 0
     return float(np.median(values[:n])) if n > 0 else otherwise
+
+
+@kernel
+def typical_bend(plane: NDArray[np.float32], stride: int = 4) -> float:
+    """The median size of second differences along every ``stride``th row of (rows, columns)."""
+    bends = np.empty(plane.size // stride + plane.shape[1], np.float32)
+    n = 0
+    for r in range(0, plane.shape[0], stride):
+        for c in range(plane.shape[1] - 2):
+            bends[n] = abs(plane[r, c] - np.float32(2.0) * plane[r, c + 1] + plane[r, c + 2])
+            n += 1 if bends[n] == bends[n] else 0
+    return float(np.median(bends[:n])) if n > 0 else np.inf

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from endo3d_core import health, rigid
 from endo3d_core.live_view import POOL, LiveView
-from endo3d_core.merging import MergedMap
-from endo3d_core.recovery import Search, believable, convincing
+from endo3d_core.merging import SETTLED, MergedMap
+from endo3d_core.recovery import WIDEST_CELLS, Search, believable, convincing, nudged
 from endo3d_core.registration import Frame6, Linearisation, NormalEquations, Scales, visible_surface
 
 Array = NDArray[np.float64]
@@ -24,10 +24,12 @@ _COARSE = 4
 _LEAST_POINTS = 300
 _LEAST_SHARE = 0.04
 """Of the grid's cells that must be valid for a cloud to count."""
-_HARDLY_A_MAP = 10
-"""Clouds that a map must hold to be worth a search."""
-_PATIENCE = 30
-"""Clouds that may fail to recover before a new submap begins."""
+_WIDER_SHARE = 0.5
+"""If fewer of the visible points agree at first, the prediction was worse than usual: look again with a wider gate."""
+_STRAYED = 4.0
+"""A last step larger than this, in point sigmas, has not converged: the result does not hold."""
+_PATIENCE, _PATIENCE_YOUNG = 30, 5
+"""Clouds that may fail to recover before a new submap begins; a map of few clouds is soon replaced."""
 _LEAST_TEXTURE = 0.001
 """Relative brightness: far below any camera's noise, it keeps the robust scale from being zero."""
 _LONGEST_GAP = 6.0
@@ -130,6 +132,11 @@ class Odometry:
         gap_ns = stamp_ns - self._last_ns
         return gap_ns <= 0 or gap_ns > _LONGEST_GAP * self._period_ns > 0
 
+    @property
+    def _is_young(self) -> bool:
+        """Hardly a point of the map has settled: its texture says nothing about its noise yet."""
+        return self._merged < SETTLED
+
     def _predict(self, stamp_ns: int) -> Array:
         return self.T_world_camera if self._is_stale(stamp_ns) else self._extrapolated(stamp_ns)
 
@@ -139,10 +146,10 @@ class Odometry:
         return self.T_world_camera @ rigid.exp(self._velocity * (stamp_ns - self._last_ns))
 
     def _recover(self, stamp_ns: int) -> Estimate:
-        """A part of the search; a new map when that keeps failing, or at once if there is hardly one yet."""
+        """A part of the search; a new submap when that keeps failing."""
         starts = [self.T_world_camera]
         if self._search is None:
-            self._search = Search(self.map, self.T_world_camera, self.view)
+            self._search = Search(self.map, self.T_world_camera, self.view, young=self._is_young)
             starts = [self._extrapolated(stamp_ns), self.T_world_camera]
         stale = self._is_stale(stamp_ns)
         T = self._search.look(self.view, starts, self._equations)
@@ -156,8 +163,8 @@ class Odometry:
                     self._velocity[:] = 0.0
                 return replace(estimate, state=State.RELOCALISED)
         self._failures += 1
-        if self._merged < _HARDLY_A_MAP or self._failures > _PATIENCE:
-            self.submap += self._merged >= _HARDLY_A_MAP
+        if self._failures > (_PATIENCE_YOUNG if self._is_young else _PATIENCE):
+            self.submap += 1
             self._forget()
             return self._begin(stamp_ns)
         return self._lost()
@@ -167,21 +174,37 @@ class Odometry:
         view, sigma_mm = self.view, self.view.sigma_mm
         frame = visible_surface(view.live)
         T, rows = predicted, self._visible
+        if self._is_young or self._is_stale(stamp_ns):
+            T = nudged(predicted, self.map, rows, view)
         gate_mm = 8.0 * self._scale_mm + view.pitch_mm
-        scales = Scales(gate_mm, 0.5 * gate_mm, 4.0 * self._texture_scale, max(self._tilt_rad, view.normal_rad))
-        for iteration in range(ITERATIONS):
-            chosen = rows if iteration else rows[::_COARSE]
+        tilt_rad = max(self._tilt_rad, view.normal_rad)
+        scales = Scales(gate_mm, 0.5 * gate_mm, 4.0 * self._texture_scale, tilt_rad)
+        iterations, steps = ITERATIONS, 0
+        while steps < iterations:
+            chosen = rows if steps else rows[::_COARSE]
             n = self._equations.at(T, self.map, chosen, view.live, view.coefficients, frame, scales)
-            if n.used < _LEAST_POINTS:
+            if steps == 0 and n.used < _WIDER_SHARE * n.visible and gate_mm < WIDEST_CELLS * view.pitch_mm:
+                gate_mm, iterations = WIDEST_CELLS * view.pitch_mm, 2 * ITERATIONS
+                scales = Scales(gate_mm, 0.25 * gate_mm, 4.0 * self._texture_scale, tilt_rad)
+                continue
+            if n.used < (_LEAST_POINTS if steps else _LEAST_POINTS // _COARSE):
                 return None
             solution = health.solve(n, sigma_mm)
             T = T @ health.motion(solution.step, frame)
             scale_mm = max(n.residual_mm, sigma_mm)
             self._tilt_rad = max(n.tilt_rad, view.normal_rad)
-            scales = Scales(8.0 * scale_mm, scale_mm, max(n.texture_residual, _LEAST_TEXTURE), self._tilt_rad)
-            if iteration and np.linalg.norm(solution.step) < _CONVERGED * sigma_mm:
+            texture_scale = max(n.texture_residual, _LEAST_TEXTURE)
+            scales = Scales(8.0 * scale_mm, scale_mm, texture_scale, self._tilt_rad)
+            steps += 1
+            moved_mm = float(np.linalg.norm(solution.step))
+            if steps > 1 and moved_mm < _CONVERGED * sigma_mm:
                 break
-        if not (convincing(n) if self._is_stale(stamp_ns) else believable(n)):
+        surprised_mm = float(np.linalg.norm(health.scaled_twist(rigid.inverse(predicted) @ T, frame)))
+        if surprised_mm > view.pitch_mm or self._is_stale(stamp_ns) or (self._is_young and solution.held.size):
+            holds = convincing(n, view.texture_noise)
+        else:
+            holds = believable(n)
+        if not holds or moved_mm > _STRAYED * scale_mm:
             return None
         self._scale_mm, self._texture_scale = min(scale_mm, 4.0 * sigma_mm), scales.texture
         self._advance(rigid.orthonormal(T), stamp_ns, solution.held, frame)

@@ -171,8 +171,9 @@ def texture_rows(
     r20, r21, r22 = np.float32(T[2, 0]), np.float32(T[2, 1]), np.float32(T[2, 2])
     gx, gy, gz, per_radius = np.float32(centre[0]), np.float32(centre[1]), np.float32(centre[2]), np.float32(1 / radius)
     zero, one, quarter, facing = np.float32(0.0), np.float32(1.0), np.float32(0.25), np.float32(FACING)
-    per_scale2, settled_count = np.float32(1.0 / (scale * scale)), np.float32(SETTLED)
+    per_scale2, least_count = np.float32(1.0 / (scale * scale)), np.float32(SETTLED)
     used, settled, squares, weights, of_map, of_both, inverse_counts = zero, zero, zero, zero, zero, zero, zero
+    misfit = zero
     for i in range(n):
         of_live, mapped, weight, count = (
             pairs[LTEXTURE + i],
@@ -199,10 +200,11 @@ def texture_rows(
             squared if holds else zero,
         )
         f, g, h = f if holds else zero, g if holds else zero, h if holds else zero
-        known = row if count >= settled_count else zero
+        known = row if count >= least_count else zero
         used += row
         settled += known
         inverse_counts += row / count
+        misfit += squared
         of_map += known * mapped * mapped
         of_both += known * mapped * of_live
         robust = one / (one + quarter * squared * per_scale2)
@@ -225,7 +227,7 @@ def texture_rows(
         out[OF_LIVE + 3 * BLOCK + i], out[OF_LIVE + 4 * BLOCK + i] = sy * hz - sz * hy, sz * hx - sx * hz
         out[OF_LIVE + 5 * BLOCK + i] = sx * hy - sy * hx
         out[DIFFERENCE + i] = -w * difference
-    return int(used), int(settled), squares, weights, of_map, of_both, inverse_counts
+    return int(used), int(settled), squares, weights, of_map, of_both, inverse_counts, misfit
 
 
 @kernel
@@ -252,7 +254,7 @@ def linearise(
     Returns the numbers of visible, used, textured and settled points and of tilts, and the robust sums.
     """
     visible = used = textured = settled = sampled = 0
-    squares = weights = texture_squares = texture_weights = of_map = of_both = inverse_counts = 0.0
+    squares = weights = texture_squares = texture_weights = of_map = of_both = inverse_counts = misfit = 0.0
     for first in range(0, chosen.size, BLOCK):
         n = associate(map_rows, map_ints, chosen[first : first + BLOCK], live, coefficients, T, pairs)
         visible += n
@@ -268,14 +270,14 @@ def linearise(
                 sampled += 1
         add_products(surface, JACOBIAN, 7, n, surface_gram)
         add_products(surface, TILT, 4, n, tilt_gram)
-        count, known, sum_squares, sum_weights, sum_map, sum_both, sum_inverse = texture_rows(
+        count, known, sum_squares, sum_weights, sum_map, sum_both, sum_inverse, sum_misfit = texture_rows(
             pairs, n, surface, T, centre, radius, texture_scale, texture
         )
         if count == 0:
             continue
         textured, settled, inverse_counts = textured + count, settled + known, inverse_counts + sum_inverse
         texture_squares, texture_weights = texture_squares + sum_squares, texture_weights + sum_weights
-        of_map, of_both = of_map + sum_map, of_both + sum_both
+        of_map, of_both, misfit = of_map + sum_map, of_both + sum_both, misfit + sum_misfit
         add_products(texture, OF_MAP, 13, n, texture_gram)
-    sums = (squares, weights, texture_squares, texture_weights, of_map, of_both, inverse_counts)
+    sums = (squares, weights, texture_squares, texture_weights, of_map, of_both, inverse_counts, misfit)
     return (visible, used, textured, settled, sampled), sums

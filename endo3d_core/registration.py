@@ -74,6 +74,8 @@ class NormalEquations:
     """Typical angle about one axis between normals of map and cloud: their noise."""
     texture_residual: float
     """The same of the differences in texture, at the cloud's typical brightness."""
+    texture_misfit: float
+    """The plain rms of the same."""
     texture_slope: float
     """Of the cloud's texture over the map's: 1 where they match, 0 at a wrong place."""
     texture_rms: float
@@ -143,7 +145,7 @@ class Linearisation:
             self._pairs, self._surface, self._texture, self._tilts, surface, tilted, texture,
         )  # fmt: skip
         visible, used, textured, settled, sampled = counts
-        squares, weights, texture_squares, texture_weights, of_map, of_both, inverse_counts = sums
+        squares, weights, texture_squares, texture_weights, of_map, of_both, inverse_counts, misfit = sums
         surface, tilted, texture = _symmetric(surface), _symmetric(tilted), _symmetric(texture)
         geometry = surface[:6, :6]
         tilt_variance = tilted[0, 0] / max(np.trace(geometry[:3, :3]), 1e-300)
@@ -160,6 +162,7 @@ class Linearisation:
             residual_mm=math.sqrt(squares / max(weights, 1e-30)),
             tilt_rad=math.sqrt(np.median(self._tilts[:sampled]) / math.log(2.0)) if sampled else 0.0,
             texture_residual=math.sqrt(texture_squares / max(texture_weights, 1e-30)),
+            texture_misfit=math.sqrt(misfit / max(textured, 1)),
             texture_slope=of_both / max(of_map, 1e-30),
             texture_rms=math.sqrt(of_map / max(settled, 1)),
         )

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from endo3d_core import recovery, trajectory
+from endo3d_core import recovery, rigid, trajectory
 from endo3d_core import simulated_clouds as sim
 from endo3d_core.merging import MergedMap
 from endo3d_core.odometry import Estimate, Odometry, State
@@ -22,11 +22,12 @@ def scan(
     scene: str,
     duration_s: float = 0.5,
     sensor: sim.Sensor = SMALL,
-    keep: slice = slice(None),
+    keep: slice | list[int] = slice(None),
 ) -> tuple[list[Estimate], np.ndarray, np.ndarray]:
     """Estimates, estimated poses and true poses of a hand-guided scan."""
     estimates, truth = [], []
-    for cloud in list(sim.clouds(sim.SCENES[scene](), sim.HandMotion(), duration_s, sensor=sensor))[keep]:
+    clouds = list(sim.clouds(sim.SCENES[scene](), sim.HandMotion(), duration_s, sensor=sensor))
+    for cloud in clouds[keep] if isinstance(keep, slice) else [clouds[k] for k in keep]:
         estimates.append(odometry.track(cloud.channels, cloud.sequence, cloud.stamp_ns))
         truth.append(cloud.T_scene_camera)
     return estimates, np.array([e.T_world_camera for e in estimates]), np.array(truth)
@@ -49,6 +50,35 @@ def test_without_texture_the_extrusion_is_held_and_reported() -> None:
     error_um = 1e3 * (poses[:, :3, 3] - moved[:, :3, 3])
     assert np.abs(error_um[:, [0, 2]]).max() < 20.0
     assert np.ptp(poses[:, 1, 3]) < 0.3, "the held direction must not run away"
+
+
+@pytest.mark.parametrize("scene", ["contour", "plane"])
+def test_a_machine_that_is_too_slow_from_the_first_cloud_on_still_tracks(scene: str) -> None:
+    """Six to ten clouds apart a hand moves by a fifth of a millimetre, wherever it likes."""
+    odometry, gaps = Odometry(), np.random.default_rng(5).integers(6, 11, 14)
+    estimates, poses, truth = scan(odometry, scene, 0.6, keep=list(np.cumsum(gaps)[np.cumsum(gaps) < 103]))
+    assert {e.state for e in estimates} <= {State.TRACKING, State.RELOCALISED}
+    assert trajectory.ate(poses, truth).rms_um < 20.0
+    assert odometry.submap == 0
+
+
+def test_bursts_of_missing_clouds_in_twice_the_motion_never_mislead() -> None:
+    """What is claimed is true: whatever is not lost lies where it says, within its submap."""
+    scene, motion = sim.plane(), sim.HandMotion(drift_mm_s=6.0, tremor_mm=0.15)
+    odometry, rng = Odometry(), np.random.default_rng(3)
+    missing, claimed, T_scene_world = 0, 0, dict[int, np.ndarray]()
+    for cloud in sim.clouds(scene, motion, 1.0, sensor=SMALL):
+        missing = missing - 1 if missing > 0 else (int(rng.integers(1, 13)) if rng.random() < 0.1 else 0)
+        if missing > 0:
+            continue
+        estimate = odometry.track(cloud.channels, cloud.sequence, cloud.stamp_ns)
+        if estimate.state is State.LOST:
+            continue
+        claimed += 1
+        T = T_scene_world.setdefault(estimate.submap, cloud.T_scene_camera @ rigid.inverse(estimate.T_world_camera))
+        off = rigid.inverse(cloud.T_scene_camera) @ T @ estimate.T_world_camera
+        assert np.linalg.norm(rigid.apply(off, [0.0, 0.0, 20.0]) - (0.0, 0.0, 20.0)) < 0.1
+    assert claimed > 60
 
 
 def jump(scene: str, by_mm: tuple[float, float, float], clouds: int) -> tuple[Odometry, list[Estimate], float]:
