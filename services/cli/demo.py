@@ -105,7 +105,7 @@ def _scan_at_its_pace(folder: Path, stack: str, settings: list[str], seconds: fl
 
 
 def scan(stack: str, overrides: list[str], seconds: float, quiet: bool, *, on_trial: bool = False) -> dict[str, Any]:
-    """Run the stack for ``seconds`` from its first cloud on; what was measured while it ran.
+    """Run the stack for ``seconds`` from its first pose on; what was measured while it ran.
 
     ``on_trial``: raises ``TooFast`` when its first seconds miss too many triggers.
     """
@@ -128,7 +128,7 @@ def scan(stack: str, overrides: list[str], seconds: float, quiet: bool, *, on_tr
         with Launcher(children_of(described, overrides), lines) as launcher, _progress(quiet) as progress:
             lines.progress = progress
             launcher.start()
-            _await_first_cloud(launcher, watch, asked, described, progress, began_s)
+            _await_first_results(launcher, watch, asked, described, progress, began_s)
             scanned_s = _scan(launcher, watch, asked, progress, seconds, on_trial)
             progress.update(progress.add_task("closing the archive", total=None))
             launcher.stop(hurry=lambda: asked.times > 1)
@@ -172,15 +172,19 @@ def _progress(quiet: bool) -> Iterator[Progress]:
         yield progress
 
 
-def _await_first_cloud(
+def _await_first_results(
     launcher: Launcher, watch: Watch, asked: Asked, stack: Stack, progress: Progress, began_s: float
 ) -> None:
+    """Until odometry has its first pose: a camera that runs before that scans in vain."""
+    from endo3d.schemas import topics
+
     names = list(stack.tables)
+    posed = any(topics.POSE in stack.kind(name).writes for name in names)
     task = progress.add_task("starting", total=len(names))
     say_at_s = time.monotonic() + PATIENCE_S
-    while not watch.clouds and not (launcher.done or asked.times):
+    while not (watch.poses if posed else watch.clouds) and not (launcher.done or asked.times):
         missing, spent_s = watch.starting(names), time.monotonic() - began_s
-        what = f"starting {', '.join(missing)}" if missing else "waiting for the first cloud"
+        what = f"starting {', '.join(missing)}" if missing else "waiting for the first results"
         what += ": compiling their kernels, the first time only" if missing and spent_s > PATIENCE_S else ""
         progress.update(task, completed=len(names) - len(missing), description=what)
         if time.monotonic() > say_at_s and not progress.console.is_terminal and not progress.disable:
@@ -198,7 +202,7 @@ def _turn_or_give_up(launcher: Launcher, began_s: float) -> None:
     if fallen := [child.name for child in launcher.children if child.state is State.GIVEN_UP]:
         raise UserError(launcher.user_error or f"{', '.join(fallen)} keeps crashing; its lines above say why")
     if time.monotonic() - began_s > START_LIMIT_S:
-        raise UserError(f"no cloud after {START_LIMIT_S:.0f} s; endo3d doctor checks this machine")
+        raise UserError(f"no results after {START_LIMIT_S:.0f} s; endo3d doctor checks this machine")
 
 
 def _scan(launcher: Launcher, watch: Watch, asked: Asked, progress: Progress, seconds: float, on_trial: bool) -> float:
