@@ -31,12 +31,17 @@ F = TypeVar("F", bound=Callable[..., Any])
 FASTMATH = {"contract", "reassoc", "arcp", "nsz"}
 """Without ``nnan`` and ``ninf``: invalid pixels are NaN, and tests for them must survive."""
 
+INLINED = {"forceinline": True}
+"""Into kernels that call them. A kernel that stays a call exists twice under one name, in its own object and,
+optimised once more, in its caller's; which of both runs would depend on what is loaded first: the process that
+compiles and those that load from the cache would differ in the last bits."""
+
 
 def kernel(function: F) -> F:
     """Compile a loop for the machine: no GIL, cached on disk, vectorisable sums, NaN kept."""
-    return cast(F, numba.njit(nogil=True, cache=True, fastmath=FASTMATH, error_model="numpy")(function))
+    return cast(F, numba.njit(nogil=True, cache=True, fastmath=FASTMATH, error_model="numpy", **INLINED)(function))
 
 
 def exact(function: F) -> F:
     """The same in strict IEEE arithmetic: for geometry in float64."""
-    return cast(F, numba.njit(nogil=True, cache=True, error_model="numpy")(function))
+    return cast(F, numba.njit(nogil=True, cache=True, error_model="numpy", **INLINED)(function))
