@@ -22,6 +22,9 @@ def check(
     as_json: JsonOption = False,
     mermaid: Annotated[bool, typer.Option("--mermaid", help="The graph for a README.")] = False,
     dot: Annotated[bool, typer.Option("--dot", help="The graph for Graphviz.")] = False,
+    zenohd: Annotated[
+        bool, typer.Option("--zenohd", help="The router's configuration, for a stock zenohd (JSON5).")
+    ] = False,
     keys: Annotated[
         str, typer.Option("--keys", metavar="SERVICE", help="List the keys of a service's table.")
     ] = "",
@@ -41,7 +44,9 @@ def check(
         _show_keys(described, keys)
         return
     wiring = graph.of(described)
-    if as_json:
+    if zenohd:
+        print(_zenohd(described))
+    elif as_json:
         print(json.dumps(wiring.as_dict(), indent=2))
     elif mermaid:
         print(wiring.mermaid())
@@ -49,6 +54,24 @@ def check(
         print(wiring.dot())
     else:
         show(_tree(described, wiring))
+
+
+def _zenohd(stack: Stack) -> str:
+    """What the router service gives to zenoh, with the certificates where a unit file has them."""
+    from pathlib import Path
+
+    from endo3d.services.runtime.errors import UserError
+    from endo3d.services.runtime.identity import AUTHORITY, Identity
+    from endo3d.services.runtime.network import nested, router_settings
+
+    if not stack.placement.hosts:
+        raise UserError(f"{stack.label} has no hosts, and so no router; add [hosts.NAME] tables")
+    folder, host = Path(stack.rig.keys or "/etc/endo3d/keys"), stack.placement.router
+    identity = Identity(folder / f"{AUTHORITY}.pem", folder / f"{host}.pem", folder / f"{host}.key")
+    settings = nested(router_settings(stack.rig.name, stack.placement, identity))
+    head = f"// Written by: endo3d check {stack.path.stem if stack.path else 'STACK'} --zenohd\n"
+    head += "// Run as: zenohd --config FILE, in the place of the stack's own router.\n"
+    return head + json.dumps(settings, indent=2)
 
 
 def _tree(stack: Stack, wiring: Graph) -> Tree:

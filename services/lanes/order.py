@@ -54,4 +54,4 @@ class InOrder:
             yield self._held.pop(sequence)[1]
 
     def _is_next(self, sequence: int) -> bool:
-        return self._last is None or (self._stride > 0 and sequence - self._last <= self._stride)
+        return self._last is None or self._stride == 0 or sequence - self._last <= self._stride

@@ -50,9 +50,7 @@ class Shares:
         piece_frames = max(1, self._piece_frames // period) * period
         start = frame.sequence - max(frame.slot, 0)  # of this sequence of patterns: pieces begin with slot 0
         piece, within = start // piece_frames, start % piece_frames + max(frame.slot, 0)
-        if self.owner(piece) == host:
-            return True
-        return piece_frames - within <= reach and self.owner(piece + 1) == host
+        return any(self.owner(piece + ahead) == host for ahead in range(1 + (within + reach) // piece_frames))
 
 
 @lru_cache(maxsize=16)

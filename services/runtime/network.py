@@ -25,8 +25,6 @@ log = logging.getLogger(__name__)
 
 _LEASE_MS: Final = 2_000
 """Silence after which a link counts as cut."""
-_SOCKET_BYTES: Final = 256 << 10
-"""40 ms of a link of 100 Mbit/s, doubled by the system; still 10 MB/s over a way of 50 ms."""
 _EGRESS_US: Final = 500_000
 """How long the router lets a large message wait for a link: it forwards for others in the same two threads."""
 _AGAIN_S: Final = 0.5
@@ -40,9 +38,6 @@ _COMMON: Final[Mapping[str, Any]] = {
     "transport/link/tx/lease": _LEASE_MS,
     "transport/unicast/open_timeout": _LEASE_MS,
     "transport/unicast/accept_timeout": _LEASE_MS,
-    # What waits for a slow link should wait where it can still be overtaken, or be replaced by what is newer.
-    "transport/link/tls/so_sndbuf": _SOCKET_BYTES,
-    "transport/link/tls/so_rcvbuf": _SOCKET_BYTES,
     "transport/link/tx/queue/size/data_high": 16,
     "transport/link/tx/queue/size/data": 16,
     "adminspace/enabled": False,
