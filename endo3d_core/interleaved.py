@@ -2,8 +2,7 @@
 
 Three forms keep the projected patterns and differ in how far they look:
 
-- ``three``: the published one, eqs. (4) to (6); a is corrected to the mean, since g[k-1] + g[k+1] is twice
-it.
+- ``three``: the published one, eqs. (4) to (6); a is corrected to the mean, since g[k-1] + g[k+1] is twice it.
   One frame of latency; its background leaks f1 into f2 as soon as anything moves.
 - ``five``: the centre's frequency from g[k-2], g[k], g[k+2]: background and signal are symmetric in time, so
   motion enters in second order only. Two frames of latency.
@@ -14,105 +13,43 @@ it.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
-from endo3d_core import bandpass, triangulation, uncertainty, unwrap, windowed_fit
-from endo3d_core.binning import Image, bin_image
-from endo3d_core.compiled import kernel
+from endo3d_core import bandpass, continuous, samples, triangulation, uncertainty, unwrap
+from endo3d_core.binning import Grid, Image, bin_image, grid_of
 from endo3d_core.patterns import PatternSet
-from endo3d_core.slot_check import SlotCheck
-from endo3d_core.triangulation import Lookup
+from endo3d_core.samples import Normalisation
+from endo3d_core.slot_check import ROW_STEP, SlotCheck
+from endo3d_core.triangulation import Lookup, Output
 
 Form = Literal["three", "five", "reuse"]
-Planes = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]
+Front = Callable[[Image, NDArray[np.float32]], None]
+"""Fills a grid (height, width) with grey values from a camera image; +inf where the sensor saturates."""
 FRAMES: dict[Form, int] = {"three": 3, "five": 5, "reuse": 7}
 """Consecutive frames that a result needs; its stamp is the middle one's."""
 
 SIGNAL_NOISE = 0.29
 """Noise of the normalised signal per relative noise sigma_g / a of a frame: sqrt(20/256) to sqrt(24/256)."""
+SATURATION = 0.98
+"""Of the full scale: brighter than the sensor can tell."""
+SAMPLES_PER_FRINGE = 12.0
+"""What the band-pass needs: on finer grids it runs on means of 2 or 4 columns."""
+COLUMNS_MAX_PX = 4
+"""Camera pixels that such a mean may span."""
 
 PERIOD = 4
-
-
-@kernel
-def _filter_reuse(
-    before: NDArray[np.float32],
-    frame: NDArray[np.float32],
-    after: NDArray[np.float32],
-    sign: float,
-    dark: float,
-    padded: NDArray[np.float32],
-    cosine: NDArray[np.float32],
-    sine: NDArray[np.float32],
-    signal: NDArray[np.float32],
-    phasor: NDArray[np.float32],
-) -> None:
-    """n[j] = sign (2 g[j] / (g[j-2] + 2 g[j] + g[j+2]) - 1/2) and its band-pass, row by row."""
-    least, s, half, zero = np.float32(4.0 * dark), np.float32(sign), np.float32(0.5), np.float32(0.0)
-    taps, width = cosine.size - 1, frame.shape[1]
-    for v in range(frame.shape[0]):
-        b, g, a, n = before[v], frame[v], after[v], signal[v]
-        inner = padded[taps : taps + width]
-        for x in range(width):
-            twice = g[x] + g[x]
-            total = b[x] + twice + a[x]
-            value = s * (twice / total - half)
-            n[x] = value if total > least else zero
-            inner[x] = n[x]
-        bandpass.filter_row(padded, cosine, sine, phasor[0, v], phasor[1, v])
-
-
-@kernel
-def _filter_difference(
-    plus: NDArray[np.float32],
-    minus: NDArray[np.float32],
-    background: NDArray[np.float32],
-    sign: float,
-    dark: float,
-    padded: NDArray[np.float32],
-    cosine: NDArray[np.float32],
-    sine: NDArray[np.float32],
-    signal: NDArray[np.float32],
-    phasor: NDArray[np.float32],
-) -> None:
-    """s = sign (plus - minus) / (2 a) and its band-pass; the background a is a mean grey value."""
-    least, s, zero = np.float32(dark), np.float32(0.5 * sign), np.float32(0.0)
-    taps, width = cosine.size - 1, plus.shape[1]
-    for v in range(plus.shape[0]):
-        p, m, a, n = plus[v], minus[v], background[v], signal[v]
-        inner = padded[taps : taps + width]
-        for x in range(width):
-            mean = a[x]
-            value = s * (p[x] - m[x]) / mean
-            n[x] = value if mean > least else zero
-            inner[x] = n[x]
-        bandpass.filter_row(padded, cosine, sine, phasor[0, v], phasor[1, v])
-
-
-@kernel
-def _weighted_mean(
-    a: NDArray[np.float32],
-    b: NDArray[np.float32],
-    c: NDArray[np.float32],
-    outer: float,
-    middle: float,
-    out: NDArray[np.float32],
-) -> None:
-    """outer a + middle b + outer c: a mean grey value in which the pi pair's fringes cancel."""
-    w, m = np.float32(outer), np.float32(middle)
-    for v in range(out.shape[0]):
-        p, q, r, row = a[v], b[v], c[v], out[v]
-        for x in range(row.size):
-            row[x] = w * (p[x] + r[x]) + m * q[x]
+GRIDS = 6
+"""Frames that are kept."""
 
 
 class Interleaved:
-    """A window over consecutive frames, decoded after each; all memory is taken at construction.
+    """A window over consecutive frames, decoded on demand after each; all memory is taken at construction.
 
-    ``push`` every frame in order; once it says True, ``phase`` and ``points`` describe the frame
+    ``push`` every frame in order; once it says True, ``decode`` and ``points`` give the result of the frame
     ``latency`` back.
     """
 
@@ -121,51 +58,93 @@ class Interleaved:
         pattern_set: PatternSet,
         lookup: Lookup,
         bin_px: int,
+        dtype: DTypeLike = np.uint8,
         *,
         form: Form = "reuse",
         fit: bool = True,
+        front: Front | None = None,
         dark_grey: float = 2.0,
+        saturation_grey: float | None = None,
         modulation_min: float = unwrap.MODULATION_MIN,
         sensor: uncertainty.Sensor = uncertainty.IMX174,
     ) -> None:
         if pattern_set.kind != "interleaved" or form not in FRAMES:
             raise ValueError(f"no {form!r} decoding of {pattern_set.text!r}")
         self.f1, self.f2 = pattern_set.frequencies
-        self.lookup, self.form, self.fit, self.bin_px = lookup, form, fit, bin_px
+        self.lookup, self.form, self.fit, self.bin_px, self.front = lookup, form, fit, bin_px, front
         self.frames = FRAMES[form]
         self.latency = self.frames // 2
-        self.dark_grey, self.modulation_min = dark_grey, modulation_min
-        self.rad_per_px = 2.0 * math.pi * self.f1 / lookup.period_px
-        self.filters = [bandpass.gabor(lookup.period_px / (f * lookup.centre_slope)) for f in (self.f1, self.f2)]
         self.count = 0
         self.slot = -1
         self._label = -1
-        shape = (lookup.height, lookup.width)
-        self._padded = [np.zeros(lookup.width + 2 * gabor.taps, np.float32) for gabor in self.filters]
-        self._grids = np.zeros((6, *shape), np.float32)
-        self.signals = np.zeros((3, *shape), np.float32)
-        self.phasors = np.zeros((3, 2, *shape), np.float32)
-        self._transposed = np.zeros(shape[::-1], np.float32)
-        self._carrier = np.zeros(shape, np.float32)
-        triangulation.carrier(lookup.planes, lookup.rows_per_node, self.rad_per_px, self._carrier)
-        self._start, self._fitted, self.phase = np.zeros((3, *shape), np.float32)
-        self.modulation, self.residual, self.intensity, self.quality = np.zeros((4, *shape), np.float32)
-        self.variance = np.zeros(shape, np.float32)
-        self._grey_variance = sensor.variance(bin_px)
+        fringe_px = [lookup.period_px / (f * lookup.centre_slope) for f in (self.f1, self.f2)]
+        plain = front is None and lookup.axis == "columns"
+        step = _columns_per_phasor(fringe_px[0], lookup.width, bin_px) if fit or plain else 1
+        self.filters = [bandpass.gabor(px / step) for px in fringe_px]
+        self._grid_step = 1 if fit else step
+        """Columns of the output per column of the grids."""
+        self._take_memory(dtype, step)
+        self._dark, self._saturation = (
+            grey / self._unit for grey in (dark_grey, saturation_grey or SATURATION * np.iinfo(dtype).max)
+        )
+        self._model = self._build_model(step, round(abs(fringe_px[0]) / 4), modulation_min, sensor)
+        carrier = np.zeros((lookup.height, lookup.width // step), np.float32)
+        triangulation.carrier(_coarse(lookup.planes[:1], step), lookup.rows_per_node, self._model.rad_per_px, carrier)
         self.slots = SlotCheck(
             self.filters[0],
-            max(1, round(abs(lookup.period_px / (self.f1 * lookup.centre_slope)) / 2)),
-            self._carrier,
+            max(1, round(abs(fringe_px[0]) / step / 2)),
+            carrier,
             self.f1,
             self.f2,
-            lookup.reach_px * self.rad_per_px,
+            lookup.reach_px * self._model.rad_per_px,
             dark_grey,
         )
-        self._quarter_px = max(1, round(abs(lookup.period_px / (self.f1 * lookup.centre_slope)) / 4))
-        self._fit_rows = np.zeros((5, lookup.width), np.float32)
-        self._fit_sums = np.zeros((3, 6, lookup.width), np.float32)
-        self._fit_padded = np.zeros((6, lookup.width + 2 * windowed_fit.HALF_COLUMNS), np.float32)
-        self._row = np.zeros((triangulation.ROW_PLANES, lookup.width), np.float32)
+
+    def _take_memory(self, dtype: DTypeLike, step: int) -> None:
+        height, width = self.lookup.height, self.lookup.width
+        kind, unit = grid_of(dtype, self.bin_px * self._grid_step, self.bin_px)
+        kind, self._unit = (np.float32, 1.0) if self.front else (kind, unit)
+        grids = np.zeros((GRIDS, height, width // self._grid_step), kind)
+        self._window = continuous.Window(
+            np.zeros((3, height, 2, width // step), np.int16),
+            np.zeros((3, height, width) if self.fit else (3, 0, 0), np.int16),
+            grids,
+        )
+        self._transposed = np.zeros(grids.shape[:0:-1], kind)
+        # Only the rows that the slot check looks at are ever filled, or even mapped.
+        self._probes = np.zeros((3, height, width // step), np.float32)
+        self._padded = [np.zeros(width // step + 2 * gabor.taps, np.float32) for gabor in self.filters]
+        self._rows = np.zeros((3, grids.shape[2]), np.float32)
+        self._scratch = continuous.scratch(width, step, self.fit)
+
+    def _build_model(
+        self, step: int, quarter_px: int, modulation_min: float, sensor: uncertainty.Sensor
+    ) -> continuous.Model:
+        lookup, outer, middle = self.lookup, 0.25, 0.5
+        if self.form == "three":
+            outer, middle = 0.5, 0.0
+        planes = lookup.planes[: triangulation.RAY_X]
+        planes = planes if self.fit else _coarse(planes, step)
+        gain = SIGNAL_NOISE if self.fit else SIGNAL_NOISE * self.filters[0].noise_gain / math.sqrt(step)
+        slope, offset = sensor.variance(self.bin_px)
+        return continuous.Model(
+            centre=planes[:1],
+            cubic=planes[1:],
+            rays=lookup.planes[triangulation.RAY_X :],
+            rows_per_node=lookup.rows_per_node,
+            rad_per_px=2.0 * math.pi * self.f1 / lookup.period_px,
+            z_min_mm=lookup.z_min_mm,
+            z_max_mm=lookup.z_max_mm,
+            f1=self.f1,
+            f2=self.f2,
+            step=step,
+            quarter_px=max(1, quarter_px),
+            modulation_min=modulation_min,
+            noise_slope=gain**2 * slope,
+            noise_offset=gain**2 * offset,
+            outer=outer * self._unit,
+            middle=middle * self._unit,
+        )
 
     def reset(self) -> None:
         """Forget the window: after a lost frame or a slipped slot."""
@@ -188,145 +167,118 @@ class Interleaved:
         self._label = label % PERIOD
         self.slot = self.slots.slot(self._label)
         self.count += 1
-        if self.lookup.axis == "columns":
-            bin_image(image, self.bin_px, self._grid(0))
-        else:
-            bin_image(image, self.bin_px, self._transposed)
-            self._grid(0)[:] = self._transposed.T
-        if self.count >= 3 and not self.slots.examine(self._grid(2), self._grid(1), self._grid(0), self._label):
+        self._take(image)
+        if self.count >= 3 and not self.slots.examine(self._probe(2), self._probe(1), self._probe(0), self._label):
             # The newest frame may begin a window, or be the first after its slot was put right.
             self._start_over()
             return False
         if self.form == "reuse" and self.count >= 5:
-            self._filter_reuse(back=2)
-        if self.count < self.frames or not self.slots.trusted:
-            return False
-        self._decode()
-        return True
+            self._normalise(2, samples.SYMMETRIC_OWN, 2, 2, (4, 2, 0))
+        return self.count >= self.frames and self.slots.trusted
 
     def points(self, out: NDArray[np.float32]) -> int:
-        """Triangulate the current result into out, the camera grid (height, width, 6); returns the valid
-        count."""
-        lookup = self.lookup
-        return triangulation.write_points(
-            lookup.planes,
-            lookup.rows_per_node,
-            1.0 / self.rad_per_px,
-            lookup.z_min_mm,
-            lookup.z_max_mm,
-            self.phase,
-            self.intensity,
-            self.quality,
-            self.variance,
-            self._row,
-            out if lookup.axis == "columns" else out.transpose(1, 0, 2),
+        """The current result into the camera grid (height, width, 6); returns the valid count."""
+        return self.decode(triangulation.output(points=out))
+
+    def decode(self, out: Output) -> int:
+        """The current result into all that ``out`` wants, on the camera grid; returns the valid count."""
+        k = self.latency
+        if self.form == "five":
+            self._normalise(k, samples.SYMMETRIC_OWN, k, k, (k + 2, k, k - 2))
+            self._normalise(k + 1, samples.SYMMETRIC_PAIR, k + 1, k - 1, (k + 2, k, k - 2))
+        elif self.form == "three":
+            self._normalise(k, samples.PUBLISHED_OWN, k, k, (k + 1, k, k - 1))
+            self._normalise(k + 1, samples.PUBLISHED_PAIR, k + 1, k - 1, (k + 1, k, k - 1))
+        decode = continuous.decode_fitted if self.fit else continuous.decode_bandpass
+        return triangulation.on_camera_grid(
+            self.lookup.axis, out, lambda grid: decode(self._window, self._places(), self._model, self._scratch, grid)
         )
+
+    def _places(self) -> continuous.Places:
+        """The centre's frequency is seen by the centre alone, the other one by its neighbours."""
+        k = self.latency
+        centre, before = self._place(k), self._place(k + 1)
+        after = self._place(k - 1) if self.form == "reuse" else before
+        f1, f2 = ((centre, centre), (before, after))[:: 1 if _of_slot(self.slot - k)[0] == 0 else -1]
+        reach = 1 if self.form == "three" else 2
+        return continuous.Places(*f1, *f2, *(self._grid_index(back) for back in (k + reach, k, k - reach)))
+
+    def _take(self, image: Image) -> None:
+        """Bin the newest frame, and copy what the slot check looks at."""
+        columns, rows = self.bin_px * self._grid_step, self.bin_px
+        newest = self._grid(0)
+        target = newest if self.lookup.axis == "columns" else self._transposed
+        if self.front is not None:
+            self.front(image, target)
+        else:
+            bin_image(image, columns, rows, target)
+        if self.lookup.axis == "rows":
+            newest[:] = self._transposed.T
+        probe = self._probe(0)
+        average = newest.shape[1] // probe.shape[1]
+        continuous.copy_rows(newest, ROW_STEP // 2, ROW_STEP, average, self._unit, self._rows[0], probe)
 
     def _start_over(self) -> None:
         """Keep the newest frame as the first of a new window, under the slot that is believed now."""
-        self._grids[0] = self._grid(0)
+        grids, probes = self._window.grids, self._probes
+        grids[0], probes[0] = self._grid(0), self._probe(0)
         self.count = 1
         self.slot = self.slots.slot(self._label)
 
-    def _grid(self, back: int) -> NDArray[np.float32]:
-        """The binned frame ``back`` frames before the newest."""
-        return self._grids[(self.count - 1 - back) % 6]  # type: ignore[no-any-return]
+    def _grid_index(self, back: int) -> int:
+        """Where the binned frame ``back`` frames before the newest is kept."""
+        return (self.count - 1 - back) % GRIDS
+
+    def _grid(self, back: int) -> Grid:
+        return self._window.grids[self._grid_index(back)]  # type: ignore[no-any-return]
 
     def _place(self, back: int) -> int:
-        """Where the signal and the phasor of that frame are kept."""
+        """Where the samples, the phasors and the probe of that frame are kept."""
         return (self.count - 1 - back) % 3
 
-    def _filter_reuse(self, back: int) -> None:
+    def _probe(self, back: int) -> NDArray[np.float32]:
+        return self._probes[self._place(back)]  # type: ignore[no-any-return]
+
+    def _normalise(self, back: int, form: Normalisation, plus: int, minus: int, mean: tuple[int, int, int]) -> None:
+        """Samples and phasors of the frame ``back`` frames before the newest, from frames that far back."""
         frequency, sign = _of_slot(self.slot - back)
         gabor, place = self.filters[frequency], self._place(back)
-        _filter_reuse(
-            self._grid(back + 2),
-            self._grid(back),
-            self._grid(back - 2),
+        samples.normalise(
+            self._grid(plus),
+            self._grid(minus),
+            self._grid(mean[0]),
+            self._grid(mean[1]),
+            self._grid(mean[2]),
+            form,
             sign,
-            self.dark_grey,
-            self._padded[frequency],
+            self._dark,
+            self._saturation,
+            self._model.step // self._grid_step,
             gabor.cosine,
             gabor.sine,
-            self.signals[place],
-            self.phasors[place],
-        )
-
-    def _filter_difference(
-        self, plus: NDArray[np.float32], minus: NDArray[np.float32], slot: int, scale: float, place: int
-    ) -> None:
-        frequency, sign = _of_slot(slot)
-        gabor = self.filters[frequency]
-        _filter_difference(
-            plus,
-            minus,
-            self.intensity,
-            scale * sign,
-            self.dark_grey,
             self._padded[frequency],
-            gabor.cosine,
-            gabor.sine,
-            self.signals[place],
-            self.phasors[place],
-        )
-
-    def _decode(self) -> None:
-        k = self.latency
-        before, centre, after = self._place(k + 1), self._place(k), self._place(k - 1)
-        if self.form == "three":
-            _weighted_mean(self._grid(k + 1), self._grid(k), self._grid(k - 1), 0.5, 0.0, self.intensity)
-        else:
-            _weighted_mean(self._grid(k + 2), self._grid(k), self._grid(k - 2), 0.25, 0.5, self.intensity)
-        if self.form != "reuse":
-            # (g[k-1] - g[k+1]) / 4a, eq. (5), and (g[k] - a) / 2a, eq. (6) with the mean for a.
-            self._filter_difference(self._grid(k + 1), self._grid(k - 1), self.slot - k - 1, 0.5, before)
-            self._filter_difference(self._grid(k), self.intensity, self.slot - k, 1.0, centre)
-            after = before
-        unwrap.beat_unwrap(
-            *self._of_both(self.phasors, before, centre, after),
-            self._carrier,
-            self.f1,
-            self.f2,
-            self.modulation_min,
-            self._start,
-            self.modulation,
-            self.residual,
-        )
-        if self.fit:
-            self._fit_window(before, centre, after)
-        else:
-            unwrap.grade(self.modulation, self.residual, self.quality)
-            gain = SIGNAL_NOISE * self.filters[0].noise_gain
-            uncertainty.bandpass_variance(self.intensity, self.modulation, *self._grey_variance, gain, self.variance)
-        unwrap.keep_smooth(self._fitted if self.fit else self._start, unwrap.NEIGHBOUR_MAX_RAD, self.phase)
-
-    def _of_both(self, planes: NDArray[np.float32], before: int, centre: int, after: int) -> Planes:
-        """The two planes whose mean is f1's, and the two of f2's: the centre's alone, its neighbours'
-        averaged."""
-        alone, neighbours = (planes[centre], planes[centre]), (planes[before], planes[after])
-        centre_is_f1 = _of_slot(self.slot - self.latency)[0] == 0
-        return (*alone, *neighbours) if centre_is_f1 else (*neighbours, *alone)
-
-    def _fit_window(self, before: int, centre: int, after: int) -> None:
-        windowed_fit.fit(
-            self._start,
-            self._carrier,
-            *self._of_both(self.signals, before, centre, after),
-            self.f2 / self.f1,
-            self._quarter_px,
-            self.modulation,
-            self.intensity,
-            (SIGNAL_NOISE**2 * self._grey_variance[0], SIGNAL_NOISE**2 * self._grey_variance[1]),
-            self.modulation_min,
-            self._fit_rows,
-            self._fit_sums,
-            self._fit_padded,
-            self._fitted,
-            self.variance,
-            self.quality,
+            self._rows,
+            self._window.samples[place],
+            self._window.phasors[place],
         )
 
 
 def _of_slot(slot: int) -> tuple[int, float]:
     """Which of the two frequencies a slot shows, and the sign that its shift of 0 or pi gives the cosine."""
     return slot % 2, 1.0 if slot % PERIOD < 2 else -1.0
+
+
+def _columns_per_phasor(fringe_px: float, width: int, bin_px: int) -> int:
+    """As many as leave the band-pass its samples per fringe."""
+    allowed = [
+        step
+        for step in (4, 2)
+        if width % step == 0 and step * bin_px <= COLUMNS_MAX_PX and abs(fringe_px) >= step * SAMPLES_PER_FRINGE
+    ]
+    return allowed[0] if allowed else 1
+
+
+def _coarse(planes: NDArray[np.float32], step: int) -> NDArray[np.float32]:
+    """(n, nodes, width) -> (n, nodes, width / step) means."""
+    means = planes.reshape(*planes.shape[:2], -1, step).mean(axis=3, dtype=np.float64)
+    return np.asarray(means, np.float32)

@@ -8,13 +8,16 @@ the row and every ``ROW_STEP_PX`` camera rows, linear between: 1..4 MB, under 0.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from endo3d_core.calibration import Rig
 from endo3d_core.compiled import kernel
+from endo3d_core.packing import pack_points, pack_xyz
 from endo3d_core.patterns import Axis
 
 ROW_STEP_PX = 16
@@ -23,8 +26,8 @@ NODES = 6
 
 CENTRE, C0, C1, C2, C3, RAY_X, RAY_Y = range(7)
 """Planes of ``Lookup.planes``."""
-ROW_PLANES = 9
-"""Of a row's scratch: the lookup's seven, depth and its sigma."""
+X, Y, Z, INTENSITY, QUALITY, SIGMA = range(6)
+"""A point's channels, and the rows of what is packed into a row of points."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +86,8 @@ def build(rig: Rig, bin_px: int, z_min_mm: float, z_max_mm: float, axis: Axis = 
     if not np.isfinite(scale):
         raise ValueError("the projector's lens model folds over inside the working volume")
     powers = (offset / scale)[..., None] ** np.arange(4)
-    cubic = np.linalg.pinv(powers) @ inverse_z / scale ** np.arange(4)
+    corrected = inverse_z + rig.bow(rays[..., :1], rays[..., 1:2], inverse_z)
+    cubic = (np.linalg.pinv(powers) @ corrected[..., None])[..., 0] / scale ** np.arange(4)
     planes = np.stack((centre, *np.moveaxis(cubic, -1, 0), rays[..., 0], rays[..., 1]))
     period = rig.projector.width if axis == "columns" else rig.projector.height
     return Lookup(
@@ -101,26 +105,13 @@ def build(rig: Rig, bin_px: int, z_min_mm: float, z_max_mm: float, axis: Axis = 
 
 
 @kernel
-def interpolate_row(planes: NDArray[np.float32], position: float, row: NDArray[np.float32]) -> None:
-    """Planes (7, nodes, width) at a node position -> the first 7 of row (9, width)."""
+def interpolate_row(planes: NDArray[np.float32], position: float, left: int, row: NDArray[np.float32]) -> None:
+    """Planes (n, nodes, width) at a node position, from column ``left`` on -> row (n, columns)."""
     node = min(int(position), planes.shape[1] - 2)
     t = np.float32(position - node)
     for p in range(planes.shape[0]):
-        a, b, out = planes[p, node], planes[p, node + 1], row[p]
+        a, b, out = planes[p, node, left : left + row.shape[1]], planes[p, node + 1, left : left + row.shape[1]], row[p]
         for x in range(out.size):
-            out[x] = a[x] + t * (b[x] - a[x])
-
-
-@kernel
-def interpolate_strip(
-    planes: NDArray[np.float32], position: float, left: int, right: int, row: NDArray[np.float32]
-) -> None:
-    """The same for columns left..right -> the first 7 of row (9, right - left or more)."""
-    node = min(int(position), planes.shape[1] - 2)
-    t = np.float32(position - node)
-    for p in range(planes.shape[0]):
-        a, b, out = planes[p, node, left:right], planes[p, node + 1, left:right], row[p]
-        for x in range(a.size):
             out[x] = a[x] + t * (b[x] - a[x])
 
 
@@ -139,82 +130,119 @@ def carrier(planes: NDArray[np.float32], per_node: float, scale: float, out: NDA
 
 
 @kernel
-def write_row(
-    row: NDArray[np.float32],
+def triangulate_row(
+    cubic: NDArray[np.float32],
     px_per_rad: np.float32,
     z_min: np.float32,
     z_max: np.float32,
-    residual: NDArray[np.float32],
-    intensity: NDArray[np.float32],
-    quality: NDArray[np.float32],
+    phase: NDArray[np.float32],
     variance: NDArray[np.float32],
-    points: NDArray[np.float32],
-) -> int:
-    """One row of phases relative to mid-depth, rad -> points (width, 6); returns the valid count.
+    z: NDArray[np.float32],
+    sigma: NDArray[np.float32],
+) -> None:
+    """Phases relative to mid-depth, rad, and their variances -> depths and their sigmas, mm, all (width,).
 
-    NaN phases and depths outside z_min..z_max become NaN points. ``row`` is the row's lookup from
-    ``interpolate_row``; its last two rows are scratch.
+    ``cubic`` (4, width) holds C0..C3 of the row. NaN phases and depths outside z_min..z_max become NaN.
     """
-    c0, c1, c2, c3, rx, ry = row[1], row[2], row[3], row[4], row[5], row[6]
-    z_row, s_row = row[7], row[8]
-    two, three, one = np.float32(2.0), np.float32(3.0), np.float32(1.0)
-    zero, nan = np.float32(0.0), np.float32(np.nan)
-    count = np.int32(0)
-    for x in range(residual.size):
-        d = residual[x] * px_per_rad
-        z = one / (c0[x] + d * (c1[x] + d * (c2[x] + d * c3[x])))
-        slope = z * z * (c1[x] + d * (two * c2[x] + d * three * c3[x])) * px_per_rad
-        inside = (z >= z_min) & (z <= z_max)
-        z_row[x] = z if inside else nan
-        s_row[x] = slope * slope * variance[x]
-    for x in range(residual.size):
+    c0, c1, c2, c3 = cubic[0], cubic[1], cubic[2], cubic[3]
+    two, three, one, nan = np.float32(2.0), np.float32(3.0), np.float32(1.0), np.float32(np.nan)
+    for x in range(phase.size):
+        d = phase[x] * px_per_rad
+        depth = one / (c0[x] + d * (c1[x] + d * (c2[x] + d * c3[x])))
+        slope = depth * depth * (c1[x] + d * (two * c2[x] + d * three * c3[x])) * px_per_rad
+        inside = (depth >= z_min) & (depth <= z_max)
+        kept = depth if inside else nan
+        z[x] = kept
         # A NaN depth makes its sigma NaN; a choice would put the root into a branch and end vectorisation.
-        s_row[x] = np.sqrt(s_row[x]) + (z_row[x] - z_row[x])
-    for x in range(residual.size):
-        z, q = z_row[x], quality[x]
-        points[x, 0] = rx[x] * z
-        points[x, 1] = ry[x] * z
-        points[x, 2] = z
-        points[x, 3] = intensity[x]
-        points[x, 4] = q if z == z else zero
-        points[x, 5] = s_row[x]
-    for x in range(residual.size):
-        count += np.int32(z_row[x] == z_row[x])
+        sigma[x] = np.sqrt(slope * slope * variance[x]) + (kept - kept)
+
+
+class Output(NamedTuple):
+    """Where a decoder writes its result; an array of size 0 is not wanted."""
+
+    points: NDArray[np.float32]
+    """(height, width, 6): x y z mm, intensity in grey values, quality 0..1, sigma of z mm."""
+    xyz: NDArray[np.float32]
+    """(height, width, 3) mm."""
+    depth: NDArray[np.uint16]
+    """(height, width): z = offset + scale * value, 0 where invalid."""
+    scale_mm: float
+    offset_mm: float
+
+
+def output(
+    points: NDArray[np.float32] | None = None,
+    xyz: NDArray[np.float32] | None = None,
+    depth: NDArray[np.uint16] | None = None,
+    scale_mm: float = 1.0,
+    offset_mm: float = 0.0,
+) -> Output:
+    """An ``Output`` of what is given, each C-contiguous."""
+    return Output(
+        _NO_POINTS if points is None else points,
+        _NO_POINTS if xyz is None else xyz,
+        _NO_DEPTH if depth is None else depth,
+        scale_mm,
+        offset_mm,
+    )
+
+
+_NO_POINTS, _NO_DEPTH = np.zeros((0, 0, 0), np.float32), np.zeros((0, 0), np.uint16)
+
+
+def on_camera_grid(axis: Axis, out: Output, decode: Callable[[Output], int]) -> int:
+    """Run ``decode`` on the decoder's grid; for patterns along rows that is the camera's transposed."""
+    if axis == "columns":
+        return decode(out)
+    turned = out._replace(
+        points=np.empty(_turned(out.points.shape), np.float32),
+        xyz=np.empty(_turned(out.xyz.shape), np.float32),
+        depth=np.empty(_turned(out.depth.shape), np.uint16),
+    )
+    count = decode(turned)
+    out.points[:], out.xyz[:] = turned.points.swapaxes(0, 1), turned.xyz.swapaxes(0, 1)
+    out.depth[:] = turned.depth.T
+    return count
+
+
+def _turned(shape: tuple[int, ...]) -> tuple[int, ...]:
+    return (shape[1], shape[0], *shape[2:])
+
+
+@kernel
+def write_row(values: NDArray[np.float32], rays: NDArray[np.float32], v: int, left: int, out: Output) -> int:
+    """Values (6, columns) of row v, without x and y, and its rays (2, columns) -> all that ``out`` wants.
+
+    ``left`` is their first column; returns the number of valid points.
+    """
+    x_row, y_row, z, quality, ray_x, ray_y = values[X], values[Y], values[Z], values[QUALITY], rays[0], rays[1]
+    zero, one, count, right = np.float32(0.0), np.float32(1.0), np.float32(0.0), left + values.shape[1]
+    if out.points.size + out.xyz.size > 0:
+        for x in range(z.size):
+            x_row[x] = ray_x[x] * z[x]
+            y_row[x] = ray_y[x] * z[x]
+    if out.points.size > 0:
+        for x in range(z.size):
+            q, depth = quality[x], z[x]
+            quality[x] = q if depth == depth else zero
+        pack_points(values, out.points[v, left:right])
+    if out.xyz.size > 0:
+        pack_xyz(values[:3], out.xyz[v, left:right])
+    if out.depth.size > 0:
+        _write_depths(z, np.float32(1.0 / out.scale_mm), np.float32(out.offset_mm), out.depth[v, left:right])
+    for x in range(z.size):
+        depth = z[x]
+        count += one if depth == depth else zero
     return int(count)
 
 
 @kernel
-def write_points(
-    planes: NDArray[np.float32],
-    per_node: float,
-    px_per_rad: float,
-    z_min: float,
-    z_max: float,
-    residual: NDArray[np.float32],
-    intensity: NDArray[np.float32],
-    quality: NDArray[np.float32],
-    variance: NDArray[np.float32],
-    row: NDArray[np.float32],
-    points: NDArray[np.float32],
-) -> int:
-    """``write_row`` over a grid (height, width); ``row`` is scratch, ``ROW_PLANES`` by width."""
-    scale, low, high = np.float32(px_per_rad), np.float32(z_min), np.float32(z_max)
-    count = 0
-    for v in range(residual.shape[0]):
-        interpolate_row(planes, v / per_node, row)
-        count += write_row(row, scale, low, high, residual[v], intensity[v], quality[v], variance[v], points[v])
-    return count
-
-
-@kernel
-def write_depth(points: NDArray[np.float32], scale_mm: float, offset_mm: float, depth: NDArray[np.uint16]) -> None:
-    """points (height, width, 6) -> depth (height, width): z = offset + scale * value, 0 where invalid."""
-    per_mm, offset, half = np.float32(1.0 / scale_mm), np.float32(offset_mm), np.float32(0.5)
-    for v in range(depth.shape[0]):
-        p, row = points[v], depth[v]
-        for x in range(row.size):
-            value = (p[x, 2] - offset) * per_mm + half
-            row[x] = np.uint16(value) if (value >= np.float32(1.0)) & (value < np.float32(65535.0)) else np.uint16(0)
+def _write_depths(z: NDArray[np.float32], per_mm: np.float32, offset: np.float32, depths: NDArray[np.uint16]) -> None:
+    half, least, most, zero = np.float32(0.5), np.float32(1.0), np.float32(65535.0), np.float32(0.0)
+    for x in range(z.size):
+        value = (z[x] - offset) * per_mm + half
+        kept = value if (value >= least) & (value < most) else zero
+        depths[x] = np.uint16(np.int32(kept))
 
 
 def exact_depth(
@@ -235,4 +263,4 @@ def exact_depth(
         value = coded(rig.projector_pixel(rays / q[..., None]), axis)
         ahead = coded(rig.projector_pixel(rays / (q + step)[..., None]), axis)
         q = q - (value - coordinate) * step / (ahead - value)
-    return 1.0 / q
+    return 1.0 / (q + rig.bow(rays[..., 0], rays[..., 1], q))

@@ -9,7 +9,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from endo3d_core.compiled import kernel
 
@@ -35,18 +34,11 @@ IMX174 = Sensor()
 
 @kernel
 def bandpass_variance(
-    background: NDArray[np.float32],
-    modulation: NDArray[np.float32],
-    slope: float,
-    offset: float,
-    gain: float,
-    variance: NDArray[np.float32],
-) -> None:
-    """Phase noise of a filtered normalised signal, all (height, width): gain * sigma_g / (background *
-    modulation)."""
-    a, b, tiny = np.float32(slope * gain * gain), np.float32(offset * gain * gain), np.float32(1e-6)
-    for v in range(variance.shape[0]):
-        mean, m, row = background[v], modulation[v], variance[v]
-        for x in range(row.size):
-            signal = max(mean[x] * m[x], tiny)
-            row[x] = (a * mean[x] + b) / (signal * signal)
+    background: np.float32, modulation: np.float32, slope: np.float32, offset: np.float32
+) -> np.float32:
+    """Phase variance of a filtered normalised signal, rad^2: (slope background + offset) / (background modulation)^2.
+
+    ``slope`` and ``offset`` are the grey values' times the square of the filter's noise gain.
+    """
+    signal = max(background * modulation, np.float32(1e-6))
+    return (slope * background + offset) / (signal * signal)

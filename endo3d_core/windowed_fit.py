@@ -34,7 +34,7 @@ DEGREES_OF_FREEDOM = 2 * 15 - 3
 
 
 @kernel
-def _smooth_base(phase: NDArray[np.float32], quarter_px: int, base: NDArray[np.float32]) -> None:
+def smooth_base(phase: NDArray[np.float32], quarter_px: int, base: NDArray[np.float32]) -> None:
     """One row of the band-pass's phase -> base: a comb (1 2 1)/4 a quarter fringe apart, which nulls its ripple.
 
     What leaks from the mirror frequency has half a fringe's period. Where the comb leaves the valid
@@ -42,7 +42,8 @@ def _smooth_base(phase: NDArray[np.float32], quarter_px: int, base: NDArray[np.f
     """
     q, quarter, two, limit = quarter_px, np.float32(0.25), np.float32(2.0), np.float32(0.5)
     width = phase.size
-    base[:] = phase
+    for x in range(q):
+        base[x], base[width - 1 - x] = phase[x], phase[width - 1 - x]
     left, here, right, inner = phase[: width - 2 * q], phase[q : width - q], phase[2 * q :], base[q : width - q]
     for x in range(inner.size):
         e = here[x]
@@ -51,7 +52,7 @@ def _smooth_base(phase: NDArray[np.float32], quarter_px: int, base: NDArray[np.f
 
 
 @kernel
-def _products(
+def products(
     base: NDArray[np.float32],
     carrier: NDArray[np.float32],
     first: NDArray[np.float32],
@@ -59,13 +60,16 @@ def _products(
     rho: np.float32,
     sums: NDArray[np.float32],
 ) -> None:
-    """One row's six products -> sums (6, width); 0 where the base is NaN."""
+    """One row's six products of the samples ``first`` of f1 and ``second`` of f2 -> sums (6, width).
+
+    0 where the base is NaN or a sample is exactly 0, which stands for dark or saturated: it says nothing, and at
+    the edge of the field it would pull.
+    """
     P, N, A, R, Q, S = sums[0], sums[1], sums[2], sums[3], sums[4], sums[5]
     zero, one = np.float32(0.0), np.float32(1.0)
     for x in range(base.size):
         phi, s1, s2 = carrier[x] + base[x], first[x], second[x]
-        # Samples that are exactly 0 were dark: they say nothing, and at the edge of the field they would pull.
-        valid = (phi == phi) & (s1 * s1 + s2 * s2 > zero)
+        valid = (phi == phi) & (s1 != zero) & (s2 != zero)
         phi = phi if valid else zero
         c1, n1 = cos_sin(phi)
         c2, n2 = cos_sin(rho * phi)
@@ -81,7 +85,7 @@ def _products(
 
 
 @kernel
-def _add_rows(a: NDArray[np.float32], b: NDArray[np.float32], c: NDArray[np.float32], out: NDArray[np.float32]) -> None:
+def add_rows(a: NDArray[np.float32], b: NDArray[np.float32], c: NDArray[np.float32], out: NDArray[np.float32]) -> None:
     """(6, width) each -> out, padded by two columns on both sides."""
     for i in range(a.shape[0]):
         p, q, r, row = a[i], b[i], c[i], out[i, 2 : out.shape[1] - 2]
@@ -90,7 +94,7 @@ def _add_rows(a: NDArray[np.float32], b: NDArray[np.float32], c: NDArray[np.floa
 
 
 @kernel
-def _solve(
+def solve(
     sums: NDArray[np.float32],
     base: NDArray[np.float32],
     modulation: NDArray[np.float32],
@@ -144,57 +148,3 @@ def _solve(
         phase[x] = start + d if good else nan
         variance[x] = noise * noise * c * m2 * a * inverse
         quality[x] = expected * g2 * power * a * inverse
-
-
-@kernel
-def fit(
-    start: NDArray[np.float32],
-    carrier: NDArray[np.float32],
-    first: NDArray[np.float32],
-    second: NDArray[np.float32],
-    third: NDArray[np.float32],
-    fourth: NDArray[np.float32],
-    rho: float,
-    quarter_px: int,
-    modulation: NDArray[np.float32],
-    background: NDArray[np.float32],
-    noise: tuple[float, float],
-    modulation_min: float,
-    scratch: NDArray[np.float32],
-    sums: NDArray[np.float32],
-    padded: NDArray[np.float32],
-    phase: NDArray[np.float32],
-    variance: NDArray[np.float32],
-    quality: NDArray[np.float32],
-) -> None:
-    """The band-pass's phase ``start`` relative to ``carrier`` -> phase, variance, quality, all (height,
-    width).
-
-    The samples of f1 are the mean of ``first`` and ``second``, those of f2 of ``third`` and ``fourth``;
-    ``noise`` is (slope, offset) of their variance times background^2 over the background's grey value.
-    Scratch: ``scratch`` (5, width), ``sums`` (3, 6, width), ``padded`` (6, width + 4).
-    """
-    height = start.shape[0]
-    ratio, least, half = np.float32(rho), np.float32(modulation_min), np.float32(0.5)
-    slope, offset = np.float32(noise[0]), np.float32(noise[1])
-    s1, s2, bases = scratch[0], scratch[1], scratch[2:]
-    padded[:] = np.float32(0.0)
-    sums[:] = np.float32(0.0)
-    for v in range(height + 1):
-        newest = sums[v % 3]
-        if v < height:
-            a, b, c, d = first[v], second[v], third[v], fourth[v]
-            for x in range(s1.size):
-                s1[x] = half * (a[x] + b[x])
-                s2[x] = half * (c[x] + d[x])
-            _smooth_base(start[v], quarter_px, bases[v % 3])
-            _products(bases[v % 3], carrier[v], s1, s2, ratio, newest)
-        else:
-            newest[:] = np.float32(0.0)
-        if v == 0:
-            continue
-        _add_rows(sums[(v + 1) % 3], sums[(v + 2) % 3], newest, padded)
-        _solve(
-            padded, bases[(v + 2) % 3], modulation[v - 1], background[v - 1], slope, offset, least,
-            phase[v - 1], variance[v - 1], quality[v - 1],
-        )  # fmt: skip

@@ -52,8 +52,12 @@ class DecoderConfig(service.Config):
     """Depth range; by default the head's."""
     dark_grey: float = 2.0
     """Mean grey value below which nothing is measured, of 255."""
+    fit: bool = True
+    """Fit the samples beyond the band-pass: exact at edges and on small objects, for about half the step's time."""
+    cloud: bool = True
+    """Publish the cloud; without it and with ``bin_px = 1`` full-resolution depth maps are left, at camera rate."""
     depth: bool = True
-    """Publish the 16-bit depth map beside the cloud."""
+    """Publish the 16-bit depth map."""
 
 
 class Decoder(service.Service[DecoderConfig]):
@@ -94,11 +98,10 @@ class Decoder(service.Service[DecoderConfig]):
         for text in ("interleaved f1=3", "conventional f=4/3 steps=3/2"):
             for bin_px in (self.config.bin_px,) if self.config.bin_px else (2, 4):
                 decoder = self._build(text, small, bin_px, np.dtype(np.uint8))
-                out = np.empty((decoder.lookup.height, decoder.lookup.width, CHANNELS), np.float32)
+                points = np.empty((decoder.lookup.height, decoder.lookup.width, CHANNELS), np.float32)
                 for k in range(decoder.frames):
                     decoder.push(image, k % len(patterns.parse(text)))
-                decoder.points(out)
-                triangulation.write_depth(out, 1.0, 0.0, np.empty(out.shape[:2], np.uint16))
+                decoder.decode(triangulation.output(points, depth=np.empty(points.shape[:2], np.uint16)))
 
     def step(self, message: Message) -> Iterator[Message]:
         match message:
@@ -134,29 +137,29 @@ class Decoder(service.Service[DecoderConfig]):
         shape = (decoder.lookup.height, decoder.lookup.width)
         if decoder.lookup.axis == "rows":
             shape = shape[::-1]
-        points = self.loan(topics.CLOUD, shape, POINT)
-        channels = points.view(np.float32).reshape(*shape, CHANNELS)
-        valid = decoder.points(channels)
-        self._counts["valid_share"] = valid / points.size
+        points = self.loan(topics.CLOUD, shape, POINT) if self.config.cloud else None
+        depth = self.loan(topics.DEPTH, shape, np.uint16) if self.config.depth else None
+        z_min, z_max = self.z_range_mm
+        scale = (z_max - z_min) / DEPTH_STEPS
+        channels = None if points is None else points.view(np.float32).reshape(*shape, CHANNELS)
+        valid = decoder.decode(triangulation.output(channels, depth=depth, scale_mm=scale, offset_mm=z_min - scale))
+        self._counts["valid_share"] = valid / (shape[0] * shape[1])
         grid_px = float(decoder.bin_px)
-        yield Cloud(
-            stamp_ns=stamp_ns,
-            sequence=sequence,
-            points=points,
-            window_frames=decoder.frames,
-            newest_stamp_ns=frame.stamp_ns,
-            epoch=frame.epoch,
-            pattern_set=frame.pattern_set,
-            grid_px=grid_px,
-            valid_count=valid,
-            slot_slips=decoder.slots.slips if isinstance(decoder, Interleaved) else 0,
-            frame_id=frame.frame_id,
-        )
-        if self.config.depth:
-            depth = self.loan(topics.DEPTH, shape, np.uint16)
-            z_min, z_max = self.z_range_mm
-            scale = (z_max - z_min) / DEPTH_STEPS
-            triangulation.write_depth(channels, scale, z_min - scale, depth)
+        if points is not None:
+            yield Cloud(
+                stamp_ns=stamp_ns,
+                sequence=sequence,
+                points=points,
+                window_frames=decoder.frames,
+                newest_stamp_ns=frame.stamp_ns,
+                epoch=frame.epoch,
+                pattern_set=frame.pattern_set,
+                grid_px=grid_px,
+                valid_count=valid,
+                slot_slips=decoder.slots.slips if isinstance(decoder, Interleaved) else 0,
+                frame_id=frame.frame_id,
+            )
+        if depth is not None:
             yield DepthMap(stamp_ns, sequence, depth, scale, z_min - scale, grid_px, frame.frame_id)
 
     def _decoder_for(self, frame: Frame) -> Interleaved | Conventional | None:
@@ -183,8 +186,11 @@ class Decoder(service.Service[DecoderConfig]):
         sensor = Sensor(FULL_WELL_ELECTRONS / full_grey, READ_NOISE_ELECTRONS)
         dark_grey = self.config.dark_grey * full_grey / 255.0
         if pattern_set.kind == "interleaved":
-            return Interleaved(pattern_set, lookup, bin_px, form=self.config.form, dark_grey=dark_grey, sensor=sensor)
-        return Conventional(pattern_set, lookup, bin_px, dtype.type, dark_grey=dark_grey, sensor=sensor)
+            return Interleaved(
+                pattern_set, lookup, bin_px, dtype, form=self.config.form, fit=self.config.fit, dark_grey=dark_grey,
+                sensor=sensor,
+            )  # fmt: skip
+        return Conventional(pattern_set, lookup, bin_px, dtype, dark_grey=dark_grey, sensor=sensor)
 
     def _calibrate_from_messages(self) -> None:
         camera, projector = self._camera, self._projector

@@ -7,7 +7,8 @@ import pytest
 from planes import Plane, field, render, small_rig
 
 from endo3d_core import patterns, triangulation
-from endo3d_core.conventional import Conventional, demodulation, phase_weights, unwrapping_chain
+from endo3d_core.conventional import Conventional
+from endo3d_core.demodulation import demodulation, phase_weights, unwrapping_chain
 
 
 def decode(text: str, *, grey: float = 180.0, exposures: tuple[float, ...] = (1.0,), seed: int = 1):  # type: ignore[no-untyped-def]
