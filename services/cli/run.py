@@ -20,11 +20,15 @@ def run(
     The launcher does this for every service; by hand it serves for debugging, or to spread a stack over
     terminals. Services may be started in any order.
 
-    Example: endo3d run decoder --stack demo --set decoder.mode=three-frame
+    Example: endo3d run decoder --stack demo --set decoder.form=three
     """
+    import os
+
+    from endo3d.services.runtime import priority
     from endo3d.services.runtime.launcher import follow_parent
 
     follow_parent()
+    priority.settle(int(os.environ.get("ENDO3D_NICE", "0")))
 
     import logging
 

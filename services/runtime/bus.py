@@ -13,6 +13,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Mapping
+from functools import partial
 from importlib.metadata import version
 from types import TracebackType
 from typing import Any, Final, Self
@@ -24,7 +25,7 @@ from zenoh.handlers import FifoChannel
 from endo3d.schemas import codec, topics
 from endo3d.schemas.messages import LogLine, Message, Status
 from endo3d.schemas.topics import Topic
-from endo3d.services.runtime import mapping, pool, segments
+from endo3d.services.runtime import mapping, pool, priority, segments
 from endo3d.services.runtime.errors import UserError
 from endo3d.services.runtime.memory import Memory
 from endo3d.services.runtime.reader import Reader
@@ -95,7 +96,7 @@ class Bus:
             )
         else:
             try:
-                view = pool.self_test()
+                view = priority.promptly(pool.self_test)
             except zenoh.ZError as error:
                 shared_memory = False
                 note = f"no shared memory ({error}): large messages go over the network; see endo3d doctor"
@@ -104,7 +105,9 @@ class Bus:
                     note = f"no zero-copy view in zenoh {version('eclipse-zenoh')}: large messages are copied"
         if note:
             log.warning(note)
-        session = open_session(meeting_ports(rig, port), shared_memory=shared_memory, settings=settings)
+        session = priority.promptly(
+            partial(open_session, meeting_ports(rig, port), shared_memory=shared_memory, settings=settings)
+        )
         return cls(rig, name, session, shared_memory, view, note)
 
     def __enter__(self) -> Self:

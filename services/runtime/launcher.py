@@ -189,10 +189,9 @@ class Launcher:
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
-            env={**self.environment, "ENDO3D_PARENT_PID": str(os.getpid())},
+            env={**self.environment, "ENDO3D_PARENT_PID": str(os.getpid()), "ENDO3D_NICE": str(child.nice)},
             start_new_session=True,
         )
-        os.setpriority(os.PRIO_PROCESS, child.process.pid, max(child.nice, os.getpriority(os.PRIO_PROCESS, 0)))
         child.state, child.started_at_s, child.partial = State.RUNNING, time.monotonic(), b""
         child.pidfd = os.pidfd_open(child.process.pid)
         assert child.process.stdout is not None
