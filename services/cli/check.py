@@ -81,7 +81,7 @@ def _tree(stack: Stack, wiring: Graph) -> Tree:
     hosts = stack.placement.services
     for entry in wiring.entries:
         other = f" [dim](module {entry.module})[/]" if entry.module != entry.name else ""
-        where = f" [yellow]on {', '.join(hosts[entry.name])}[/]" if hosts else ""
+        where = f" [yellow]on {', '.join(hosts[entry.name]) or 'no host: zenohd stands in'}[/]" if hosts else ""
         branch = tree.add(f"[bold cyan]{entry.name}[/]{other}{where}")
         for topic in entry.kind.writes:
             how = f"{topic.message.__name__}, up to {topic.rate_hz:g} Hz"

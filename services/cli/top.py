@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 STATUS_WITHIN_S = 3.0
 """Services report about once a second."""
+CLOCK = "clock_offset_ms"
+"""A relay's value: the rig's clock minus its own host's."""
 STATE_STYLES = {"running": "green", "ready": "green", "degraded": "yellow", "failed": "red", "stopped": "dim"}
 
 
@@ -66,9 +68,10 @@ def top(
     once: Annotated[bool, typer.Option("--once", help="Print the table once and end.")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Live table of the services: rate, latency, drops, CPU, memory.
+    """Live table of the services of all hosts: rate, latency, drops, CPU, memory.
 
-    Latency counts from the exposure of the newest frame involved to the end of the step.
+    Latency counts from the exposure of the newest frame involved to the end of the step; on another host, by the
+    rig's clock. Below stands how far each host's clock is off, and what its lines carry.
 
     Examples: endo3d top; endo3d top --once --json
     """
@@ -114,25 +117,41 @@ def _table(board: Board, rig: str) -> Table:
     from rich.table import Table
     from rich.text import Text
 
+    rows = board.snapshot()
+    ahead_ms = {status.host: status.values.get(CLOCK, 0.0) for status, _ in rows if CLOCK in status.values}
     table = Table(title=f"endo3d/{rig}", box=box.SIMPLE_HEAD, title_justify="left", expand=True)
-    for name in ("service", "state"):
+    for name in ("host", "service", "state"):
         table.add_column(name, no_wrap=True)
     for name in ("rate Hz", "p50 ms", "p99 ms", "CPU %", "MB"):
         table.add_column(name, justify="right", no_wrap=True)
     table.add_column("lost, and why it is slow", ratio=1)
-    for status, there in board.snapshot():
+    for status, there in rows:
         state = str(status.state) if there else "gone"
         lost = ", ".join(f"{cause} {count}" for cause, count in status.dropped.items() if count)
+        late_ms = ahead_ms.get(status.host, 0.0)
         table.add_row(
+            status.host,
             status.service,
             Text(state, STATE_STYLES.get(state, "red")),
             f"{status.rate_hz:.1f}",
-            f"{status.latency_p50_ms:.1f}",
-            f"{status.latency_p99_ms:.1f}",
+            f"{status.latency_p50_ms + late_ms:.1f}",
+            f"{status.latency_p99_ms + late_ms:.1f}",
             f"{100 * status.cpu_share:.0f}",
             f"{status.memory_mb:.0f}",
             "\n".join(filter(None, (lost, status.note))) or "-",
         )
+    table.caption = "\n".join(filter(None, (_links(status) for status, _ in rows)))
     if not board.statuses:
         table.caption = "nobody is there yet; Ctrl-C ends"
     return table
+
+
+def _links(status: Status) -> str:
+    """What a relay knows of its host's clock and lines; empty of any other service."""
+    parts = []
+    if CLOCK in status.values:
+        parts.append(f"clock {-status.values[CLOCK]:+.2f} ms (+-{status.values['round_trip_ms'] / 2:.2f} ms)")
+    for name, value in status.values.items():
+        if name.startswith("mbit_s to "):
+            parts.append(f"{value:.1f} Mbit/s {name.removeprefix('mbit_s ')}")
+    return f"{status.host}: {', '.join(parts)}" if parts else ""

@@ -84,6 +84,8 @@ class HostTable(BaseModel):
     """What its certificate has to say: ``rig`` takes part, ``operator`` sees and commands, ``viewer`` sees."""
     preview: Preview | None = None
     """Its link is thin; None: it gets what it reads as it is."""
+    own_router: bool = True
+    """False: a stock ``zenohd`` listens there, and endo3d starts no router."""
     streams: tuple[str, ...] = ()
     """Topics sent to it though none of its services reads them: for ``tap`` and programs of your own."""
 
@@ -141,7 +143,9 @@ def placement_of(hosts: Mapping[str, HostTable], tables: Mapping[str, Mapping[st
         raise UserError(f'[hosts.{addressed[0]}] runs the router and has to be trusted: role = "rig"')
     services: dict[str, tuple[str, ...]] = {}
     for table, keys in tables.items():
-        usual = tuple(hosts) if table == RELAY else (addressed[0],)
+        usual: tuple[str, ...] = tuple(hosts) if table == RELAY else (addressed[0],)
+        if table == ROUTER and not hosts[addressed[0]].own_router:
+            usual = ()
         given = keys.get("host", usual)
         services[table] = (given,) if isinstance(given, str) else tuple(given)
         for name in services[table]:
