@@ -7,6 +7,7 @@ which are given little to do, but hold the writers' memory until they have done 
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import os
 import platform
@@ -14,6 +15,7 @@ import struct
 import sys
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from typing import Final, TypeVar
 
 T = TypeVar("T")
@@ -45,6 +47,10 @@ def settle(nice: int) -> None:
         return
     if nice > 0:
         os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
+        if os.getsid(0) == os.getpid():
+            # On most systems the processor is shared out among sessions first, and the launcher gave us one.
+            with contextlib.suppress(OSError):  # not on this one
+                Path("/proc/self/autogroup").write_text(str(nice))
     elif (number := _SCHED_SETATTR.get(platform.machine())) is not None:
         attributes = _ATTRIBUTES.pack(_ATTRIBUTES.size, os.SCHED_OTHER, 0, nice, 0, _SLICE_NS, 0, 0)
         ctypes.CDLL(None).syscall(number, 0, attributes, 0)  # a kernel before 6.12 goes on as it was
