@@ -148,11 +148,11 @@ class Board:
 
 def _blob_detector(shape: tuple[int, ...]) -> Any:
     """OpenCV's own takes no circle larger than 80 px across."""
-    wanted = cv2.SimpleBlobDetector_Params()
+    wanted = cv2.SimpleBlobDetector.Params()
     wanted.minArea, wanted.maxArea = 30.0, shape[0] * shape[1] / 50
     wanted.minDistBetweenBlobs = 5.0
     wanted.filterByConvexity, wanted.minConvexity = True, 0.8
-    return cv2.SimpleBlobDetector_create(wanted)
+    return cv2.SimpleBlobDetector.create(wanted)
 
 
 @lru_cache(maxsize=2)

@@ -34,6 +34,7 @@ PANELS: dict[str, dict[str, str]] = {
     },
     "Set up": {
         "doctor": "Check this machine, and say what to do.",
+        "calibrate": "Calibrate camera and projector: capture, solve, verify, export.",
         "check": "Check a stack file and print its dataflow.",
         "run": "Run one service of a stack in this process.",
         "devices": "List cameras and projectors, and try them.",

@@ -1,0 +1,1 @@
+"""Calibration as a task: capture board poses, solve, verify, report, export."""
