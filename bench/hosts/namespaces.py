@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import shutil
 import signal
@@ -12,8 +13,14 @@ from collections.abc import Mapping, Sequence
 from types import TracebackType
 from typing import Any, Self
 
+PR_SET_PDEATHSIG = 1
 _BURST_MS = 20
 """Of a token bucket: what the system's timer may be late by."""
+
+
+def _die_with_parent() -> None:
+    """In a child: nothing is left running, however this process ends."""
+    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGTERM, 0, 0, 0)
 
 
 def obstacle() -> str:
@@ -79,6 +86,7 @@ class Network:
             ["ip", "netns", "exec", self.space(name), *command],
             env={**os.environ, **(environment or {})},
             start_new_session=True,
+            preexec_fn=_die_with_parent,
             **options,
         )
         self._processes.append(process)
@@ -123,7 +131,9 @@ class Network:
         self._in(self._switch, "ip", "link", "set", port, "gso_max_segs", "1")
         wire = [sys.executable, "-m", "bench.hosts.wire", name, end, f"{delay_ms}", f"{loss}"]
         command = ["ip", "netns", "exec", self._switch, *wire]
-        process = subprocess.Popen(command, start_new_session=True, stdout=subprocess.PIPE)
+        process = subprocess.Popen(
+            command, start_new_session=True, preexec_fn=_die_with_parent, stdout=subprocess.PIPE
+        )
         self._processes.append(process)
         assert process.stdout is not None
         process.stdout.readline()  # it is in place

@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import os
 import signal
+import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
@@ -140,6 +141,7 @@ def main() -> None:
     seconds = parser.parse_args().seconds
     if why := obstacle():
         raise SystemExit(why)
+    signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))  # namespaces have to be undone
     print("| link, or what happens | rig Hz | lost there | images, clouds, poses, map Hz | age ms | back after s |")
     print("|---|---|---|---|---|---|", flush=True)
     worst = 0.0

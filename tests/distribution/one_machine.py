@@ -74,18 +74,24 @@ def make_keys(stack: Stack, folder: Path) -> None:
         make_host(folder, folder, name, host.role, [], 2)
 
 
+def _itself(message: Message) -> object:
+    return message
+
+
 class Seen:
     """What came on a bus; ``wait`` for what should."""
 
-    def __init__(self, bus: Bus, *wanted: Topic) -> None:
+    def __init__(self, bus: Bus, *wanted: Topic, keep: Callable[[Any], object] = _itself) -> None:
+        """keep: what to keep of a message: arrays that are kept keep their shared memory, which is bounded."""
         self.messages: dict[Topic, list[Any]] = defaultdict(list)
+        self._keep = keep
         self._came = threading.Condition()
         for topic in wanted:
             bus.subscribe(topic, self._take)
 
     def _take(self, message: Message) -> None:
         with self._came:
-            self.messages[topics.of(message)].append(message)
+            self.messages[topics.of(message)].append(self._keep(message))
             self._came.notify_all()
 
     def wait(self, condition: Callable[[dict[Topic, list[Any]]], bool]) -> None:
