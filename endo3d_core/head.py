@@ -27,6 +27,8 @@ class Head:
     """Diameter of what the projector fibre sees of the pattern generator."""
     defocus_per_mm: float
     """Growth of the blur's sigma at the object per length out of focus."""
+    core_map: str = ""
+    """File of the camera fibre's core map, beside the head's; ``fibre: core_map:``."""
 
     @property
     def camera_pitch_px(self) -> float:
@@ -47,13 +49,13 @@ class Head:
             raise ValueError(f"the head's file is not YAML: {str(error).splitlines()[0]}") from error
         section = tree.get("head") if isinstance(tree, Mapping) else None
         if not isinstance(section, Mapping):
-            raise ValueError(
-                "the calibration has no 'head' section; take one from the head files in deploy/heads"
-            )
+            raise ValueError("the calibration has no 'head' section; take one from the head files in deploy/heads")
         flat: dict[str, Any] = dict(section)
         for key, value in dict(flat.pop("fibre", {})).items():
             flat[f"fibre_{key}"] = value
-        missing = [f.name for f in fields(cls) if f.name not in flat]
+        numbers = [f.name for f in fields(cls) if f.name != "core_map"]
+        missing = [name for name in numbers if name not in flat]
         if missing:
             raise ValueError(f"the head section has no {missing[0].replace('fibre_', 'fibre.')!r}")
-        return cls(**{f.name: float(flat[f.name]) for f in fields(cls)})
+        core_map = str(flat.get("fibre_core_map", ""))
+        return cls(**{name: float(flat[name]) for name in numbers}, core_map=core_map)

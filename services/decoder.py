@@ -3,8 +3,10 @@ otherwise."""
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Iterator, Mapping
+from functools import lru_cache
 from pathlib import Path
 from typing import Literal
 
@@ -26,6 +28,8 @@ from endo3d_core import patterns, triangulation
 from endo3d_core.binning import BINS
 from endo3d_core.calibration import Lens, Rig
 from endo3d_core.conventional import Conventional
+from endo3d_core.fibre import CoreMap
+from endo3d_core.fibre_operator import FibreOperator, FibreSensor
 from endo3d_core.head import Head
 from endo3d_core.interleaved import Form, Interleaved
 from endo3d_core.uncertainty import Sensor
@@ -38,11 +42,16 @@ DEPTH_STEPS = 65_000
 """Of a depth map over the depth range: 0.1 um for 7 mm."""
 FULL_WELL_ELECTRONS = 32_000.0
 READ_NOISE_ELECTRONS = 7.0
+SATURATION = 0.98
+"""Of the grey range: what lies above counts as clipped."""
 
 
 class DecoderConfig(service.Config):
     head: str = ""
     """Calibration file to start with; calibration messages replace it."""
+    fibre: str = ""
+    """Map of the camera fibre's cores (``endo3d calibrate fibre``): the honeycomb goes and crosstalk is undone. By
+    default the one that the head's file names (``head: fibre: core_map:``, beside it)."""
     bin_px: Literal[1, 2, 4] | None = None
     """Camera pixels per grid step; by default as many as make a grid of about the fibre's resolution."""
     form: Form = "reuse"
@@ -70,6 +79,7 @@ class Decoder(service.Service[DecoderConfig]):
     def __init__(self, config: DecoderConfig) -> None:
         super().__init__(config)
         self.rig: Rig | None = None
+        self._core_map = Path(config.fibre) if config.fibre else None
         self.z_range_mm = (0.0, 0.0)
         self._camera: CameraCalibration | None = None
         self._projector: ProjectorCalibration | None = None
@@ -88,16 +98,20 @@ class Decoder(service.Service[DecoderConfig]):
             self._calibrate(Rig.from_yaml(text), text)
         except (OSError, ValueError) as error:
             raise UserError(f"decoder: {self.config.head}: {error}") from error
+        if "core_map" in text and not self.config.fibre:
+            self._core_map = Path(self.config.head).parent / Head.from_yaml(text).core_map
 
     def warm(self) -> None:
-        """Compile every kernel on a small image."""
+        """Compile every kernel on a small image; with a core map on a whole one, whose operator takes long to make."""
         if self.rig is None:
             return
-        small = Rig(self.rig.camera.binned(8), self.rig.projector, self.rig.R, self.rig.t)
-        image = np.full((small.camera.height, small.camera.width), 100, np.uint8)
+        rig, bins = self.rig, [_bins_for(self.rig.camera.width)]
+        if self._core_map is None:
+            rig, bins = Rig(rig.camera.binned(8), rig.projector, rig.R, rig.t), [2, 4]
+        image = np.full((rig.camera.height, rig.camera.width), 100, np.uint8)
         for text in ("interleaved f1=3", "conventional f=4/3 steps=3/2"):
-            for bin_px in (self.config.bin_px,) if self.config.bin_px else (2, 4):
-                decoder = self._build(text, small, bin_px, np.dtype(np.uint8))
+            for bin_px in [self.config.bin_px] if self.config.bin_px else bins:
+                decoder = self._build(text, rig, bin_px, np.dtype(np.uint8))
                 points = np.empty((decoder.lookup.height, decoder.lookup.width, CHANNELS), np.float32)
                 for k in range(decoder.frames):
                     decoder.push(image, k % len(patterns.parse(text)))
@@ -113,6 +127,12 @@ class Decoder(service.Service[DecoderConfig]):
             case ProjectorCalibration():
                 self._projector = message
                 self._calibrate_from_messages()
+
+    def void(self) -> None:
+        """No later window may hold that frame."""
+        if self._current is not None:
+            self._counts["windows_dropped"] += 1.0
+            self._current.reset()
 
     def values(self) -> Mapping[str, float]:
         return self._counts
@@ -181,16 +201,33 @@ class Decoder(service.Service[DecoderConfig]):
         self, text: str, rig: Rig, bin_px: int, dtype: np.dtype[np.uint8] | np.dtype[np.uint16]
     ) -> Interleaved | Conventional:
         pattern_set = patterns.parse(text)
+        front, sensor, saturation_grey = self._front(rig, bin_px, dtype)
         lookup = triangulation.build(rig, bin_px, *self.z_range_mm, pattern_set.axis)
-        full_grey = float(np.iinfo(dtype).max)
-        sensor = Sensor(FULL_WELL_ELECTRONS / full_grey, READ_NOISE_ELECTRONS)
-        dark_grey = self.config.dark_grey * full_grey / 255.0
+        dark_grey = self.config.dark_grey * float(np.iinfo(dtype).max) / 255.0
         if pattern_set.kind == "interleaved":
             return Interleaved(
-                pattern_set, lookup, bin_px, dtype, form=self.config.form, fit=self.config.fit, dark_grey=dark_grey,
-                sensor=sensor,
+                pattern_set, lookup, bin_px, dtype, form=self.config.form, fit=self.config.fit, front=front,
+                dark_grey=dark_grey, saturation_grey=saturation_grey, sensor=sensor,
             )  # fmt: skip
-        return Conventional(pattern_set, lookup, bin_px, dtype, dark_grey=dark_grey, sensor=sensor)
+        return Conventional(
+            pattern_set, lookup, bin_px, dtype, front=front, dark_grey=dark_grey, saturation_grey=saturation_grey,
+            sensor=sensor,
+        )  # fmt: skip
+
+    def _front(
+        self, rig: Rig, bin_px: int, dtype: np.dtype[np.uint8] | np.dtype[np.uint16]
+    ) -> tuple[FibreOperator | None, Sensor, float | None]:
+        """What fills the grids instead of binning, the noise of its samples, and from which grey on they saturate."""
+        full_grey = float(np.iinfo(dtype).max)
+        plain = Sensor(FULL_WELL_ELECTRONS / full_grey, READ_NOISE_ELECTRONS)
+        if self._core_map is None:
+            return None, plain, None
+        try:
+            front = _operator(self._core_map, rig.camera.width, rig.camera.height, bin_px, full_grey).another()
+        except (OSError, ValueError) as error:
+            raise UserError(f"decoder: {self._core_map}: {error}") from error
+        sensor = FibreSensor(plain.electrons_per_grey, plain.read_noise_electrons, front.noise_gains)
+        return front, sensor, math.inf
 
     def _calibrate_from_messages(self) -> None:
         camera, projector = self._camera, self._projector
@@ -216,6 +253,18 @@ class Decoder(service.Service[DecoderConfig]):
         self.rig, self.z_range_mm = rig, (z_min, z_max)
         self._decoders.clear()
         self._current = None
+
+
+@lru_cache(maxsize=4)
+def _operator(core_map: Path, width: int, height: int, bin_px: int, full_grey: float) -> FibreOperator:
+    """For images of that size, which a camera may have binned; making it takes seconds."""
+    cores = CoreMap.from_npz(core_map.read_bytes())
+    factor = cores.flat.shape[1] // width
+    if factor < 1 or cores.flat.shape != (height * factor, width * factor):
+        raise ValueError(f"the core map is of {cores.flat.shape[1]}x{cores.flat.shape[0]}, frames of {width}x{height}")
+    operator = FibreOperator(cores if factor == 1 else cores.binned(factor), bin_px, SATURATION * full_grey)
+    operator.noise_gains  # noqa: B018  measured once, for all
+    return operator
 
 
 def _bins_for(width_px: int) -> int:

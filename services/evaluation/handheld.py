@@ -97,7 +97,7 @@ def _run(variant: str, frames: int, first: int = 0) -> VirtualRun:
 def _scan(settings: Settings, seconds: float, kept: Path) -> Result:
     """The whole scan; beside it a part of it anew, also with exact calibration and with true poses."""
     run, true = _run("all effects", round(RATE_HZ * seconds)), head_yaml(HEAD)
-    decoding, exact = Clouds(run, calibrated(true)), Clouds(run, true)
+    decoding, exact = Clouds(settings, run, calibrated(true)), Clouds(settings, run, true)
     hand, part, placed, exact_part = (Merging(MERGING_UM, true_poses=k == 2) for k in range(4))
     for frame, truth in settings.shots(run):
         in_part = SHARE_FIRST <= frame.sequence < SHARE_FIRST + SHARE_FRAMES
@@ -125,7 +125,7 @@ def _scan(settings: Settings, seconds: float, kept: Path) -> Result:
 def _variant(settings: Settings, variant: str, before: int) -> Result:
     """That part with frames that lack an effect."""
     run = _run(variant, SHARE_FRAMES, SHARE_FIRST)
-    decoding, hand = Clouds(run, calibrated(head_yaml(HEAD))), Merging(MERGING_UM)
+    decoding, hand = Clouds(settings, run, calibrated(head_yaml(HEAD))), Merging(MERGING_UM)
     for done, (frame, truth) in enumerate(settings.shots(run), start=1):
         for cloud, where in decoding.of(frame, truth):
             hand.add(cloud, where)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from endo3d.schemas.messages import Cloud, Frame, Pose, Truth
 from endo3d.services.decoder import Decoder
 from endo3d.services.evaluation import prerender
+from endo3d.services.evaluation.flat_field import core_map
 from endo3d.services.evaluation.virtual_run import VirtualRun
 from endo3d.services.odometry import Odometry
 from endo3d_core.live_view import LiveView
@@ -52,8 +53,9 @@ class Settings:
 class Clouds:
     """The decoder's own steps over the frames of a run."""
 
-    def __init__(self, run: VirtualRun, calibration_yaml: str) -> None:
-        self._decoder = Decoder(Decoder.Config(depth=False))
+    def __init__(self, settings: Settings, run: VirtualRun, calibration_yaml: str) -> None:
+        fibre = str(core_map(run.head_yaml, settings.folder)) if run.effects.camera_fibre else ""
+        self._decoder = Decoder(Decoder.Config(depth=False, fibre=fibre))
         for message in run.calibration(calibration_yaml):
             list(self._decoder.step(message))
         self._truths: dict[int, Truth] = {}
@@ -69,7 +71,7 @@ class Clouds:
 
 def clouds(settings: Settings, run: VirtualRun, calibration_yaml: str) -> Iterator[Measured]:
     """All clouds of a run."""
-    decoding = Clouds(run, calibration_yaml)
+    decoding = Clouds(settings, run, calibration_yaml)
     for frame, truth in settings.shots(run):
         yield from decoding.of(frame, truth)
 

@@ -12,6 +12,7 @@ from endo3d.schemas.messages import CameraCalibration, Cloud, DepthMap, Frame, P
 from endo3d.services.decoder import Decoder, DecoderConfig
 from endo3d.services.runtime.errors import UserError
 from endo3d_core import patterns, triangulation
+from endo3d_core.fibre import NO_CROSSTALK, CoreMap
 
 INTERLEAVED = "interleaved f1=25"
 PERIOD_NS = 7_576_000
@@ -126,6 +127,50 @@ def test_a_replay_is_bit_exact(images) -> None:  # type: ignore[no-untyped-def]
         if isinstance(a, Cloud):
             assert isinstance(b, Cloud)
             np.testing.assert_array_equal(a.channels, b.channels)
+
+
+def honeycomb(pitch_px: float = 4.0) -> CoreMap:
+    """Cores that the small rig's camera could see: their flat image and where they are."""
+    camera = small_rig().camera
+    v, u = np.mgrid[0 : camera.height, 0 : camera.width]
+    middle = ((camera.width - 1) / 2, (camera.height - 1) / 2)
+    i, j = np.meshgrid(np.arange(-90, 91), np.arange(-90, 91))
+    at = np.stack((i + 0.5 * (j % 2), np.sqrt(0.75) * j), axis=-1).reshape(-1, 2) * pitch_px
+    cores = at[np.hypot(*at.T) < 0.3 * camera.width] + middle
+    flat = np.zeros(u.shape)
+    for k in ((0.0, 2.0), (np.sqrt(3.0), 1.0), (np.sqrt(3.0), -1.0)):  # three waves at 60 degrees
+        wave = 2 * np.pi / (np.sqrt(3.0) * pitch_px) * np.array(k)
+        flat += np.cos(wave[0] * (u - middle[0]) + wave[1] * (v - middle[1]))
+    flat = 60.0 * (1.6 + flat) * (np.hypot(u - middle[0], v - middle[1]) < 0.305 * camera.width)
+    return CoreMap(flat.astype(np.float32), cores, pitch_px, NO_CROSSTALK)
+
+
+def test_a_core_map_takes_the_place_of_binning(tmp_path, images) -> None:  # type: ignore[no-untyped-def]
+    cores = honeycomb()
+    path = tmp_path / "head.fibre.npz"
+    path.write_bytes(cores.to_npz())
+    service = decoder(fibre=str(path))
+    share = cores.flat / cores.flat.max()
+    seen = {INTERLEAVED: [np.rint(share * image).astype(np.uint8) for image in images[INTERLEAVED]]}
+    cloud = next(m for k in range(7) for m in service.step(frame(seen, k)))
+    assert isinstance(cloud, Cloud)
+    truth = Plane().depth(small_rig().camera.ray(triangulation.grid_pixels(small_rig(), 2, "columns")))
+    inner = np.s_[100:200, 190:290]
+    assert np.isfinite(cloud.points["z"][inner]).mean() > 0.99
+    assert np.nanstd((cloud.points["z"] - truth)[inner]) < 8e-3
+
+
+def test_a_head_names_its_core_map(tmp_path) -> None:  # type: ignore[no-untyped-def]
+    text = (HEADS / "base6_wd20.yaml").read_text()
+    head = tmp_path / "head.yaml"
+    head.write_text(text.replace("    cores: 100000", "    cores: 100000\n    core_map: head.fibre.npz"))
+    service = Decoder(DecoderConfig(head=str(head)))
+    service.open()
+    with pytest.raises(UserError, match=r"head\.fibre\.npz"):
+        service.warm()
+    (tmp_path / "head.fibre.npz").write_bytes(b"not it")
+    with pytest.raises(UserError, match="no map of fibre cores"):
+        service.warm()
 
 
 def test_warming_compiles_without_frames() -> None:
