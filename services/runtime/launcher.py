@@ -26,7 +26,7 @@ BACKOFF_S = (0.2, 0.5, 1.0, 2.0, 5.0)
 """Wait before the n-th restart; after the last one the service is given up."""
 SETTLED_S = 20.0
 """A service that ran this long starts with a clean record."""
-STOP_GRACE_S = 10.0
+STOP_GRACE_S = 30.0
 """From asking a service to stop to killing it."""
 EXIT_USER_ERROR = 2
 

@@ -193,6 +193,7 @@ class Runner:
         self._failures_in_a_row = 0
         if not (intact and self._bus.intact()):
             self._bus.tally.drop(work, "invalidated")
+            self._service.void()
             return False
         return True
 

@@ -104,6 +104,9 @@ class Service(Generic[C]):
         """One message in, any number out."""
         return iter(())
 
+    def void(self) -> None:
+        """Forget what the last message brought: its memory was taken back while it was read."""
+
     def command(
         self, verb: str, parameters: Mapping[str, Any], now_ns: int
     ) -> Iterator[Message | Mapping[str, Any]]:

@@ -8,8 +8,10 @@ import os
 import subprocess
 import sys
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from recorded import record, same, scan
 from rendered import RATE_HZ, STACK, messages, write
@@ -60,6 +62,26 @@ def test_the_bits_of_the_live_steps(log: Path) -> None:
         replayed = [result.message for result in engine.replay(recorded, pipeline)]
     assert len(live) == len(replayed) > 0
     assert all(same(left, right) for left, right in zip(live, replayed, strict=True))
+
+
+def test_a_frame_that_was_overwritten_is_in_no_window(log: Path) -> None:
+    """The runner says so when a frame's memory was taken back while it was read."""
+    recorded = Log(log)
+    with engine.stack_of(recorded) as stack, engine.pipeline_of(stack, ["decoder"]) as pipeline:
+        intact = points_of(result.message for result in engine.replay(recorded, pipeline))
+    decoder = Decoder(DecoderConfig(head=str(engine.stack_file.stock("heads")["base6_wd20"])))
+    decoder.open()
+    made: list[Message] = []
+    for frame in recorded.messages(topics.FRAME):
+        assert isinstance(frame, Frame)
+        if frame.sequence == 8:
+            list(decoder.step(replace(frame, image=np.full_like(frame.image, 90))))
+            decoder.void()
+        else:
+            made += decoder.step(frame)
+    after = points_of(made)
+    assert max(after) > 8 > min(after)
+    assert after == {sequence: intact[sequence] for sequence in after}
 
 
 def test_other_parameters(log: Path) -> None:
