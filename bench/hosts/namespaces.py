@@ -72,6 +72,8 @@ class Network:
             except subprocess.TimeoutExpired:
                 os.killpg(process.pid, signal.SIGKILL)
                 process.wait()
+            if process.stdout is not None:
+                process.stdout.close()
         for space in (self._switch, *map(self.space, self.names)):
             subprocess.run(["ip", "netns", "del", space], capture_output=True, check=False)
 

@@ -30,7 +30,8 @@ class Witness:
         self.now: dict[str, Any] = {}
         self.answers: list[Any] = []
         self._changed = threading.Condition()
-        threading.Thread(target=self._read, daemon=True).start()
+        self._thread = threading.Thread(target=self._read, daemon=True)
+        self._thread.start()
 
     def until(self, condition: Callable[[dict[str, Any]], Any], limit_s: float = 120.0) -> dict[str, Any]:
         """The first state that fulfils the condition. Raises ``TimeoutError`` with the last one."""
@@ -52,6 +53,14 @@ class Witness:
 
     def count(self, topic: str) -> int:
         return int(self.now.get("counts", {}).get(topic, 0))
+
+    def close(self) -> None:
+        self.process.terminate()
+        self.process.wait()
+        self._thread.join()
+        for pipe in (self.process.stdin, self.process.stdout):
+            if pipe is not None:
+                pipe.close()
 
     def _read(self) -> None:
         assert self.process.stdout is not None
@@ -94,7 +103,7 @@ class Hosts:
         keys = self._folder / "keys"
         make_authority(keys, self.stack.rig.name, 2)
         for name, host in self.stack.placement.hosts.items():
-            make_host(keys, keys, name, host.role, [self.network.address[name]], 2)
+            make_host(keys, keys, name, host.role, [self.network.address.get(name, name)], 2)
         for name in self.network.names:
             self.start(name)
         return self
@@ -116,6 +125,8 @@ class Hosts:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        for witness in self.witness.values():
+            witness.close()
         for process in self.up.values():
             process.terminate()
         for process in self.up.values():
