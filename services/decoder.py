@@ -6,11 +6,13 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
+from pydantic import AliasChoices, Field
 
 from endo3d.schemas import topics
 from endo3d.schemas.messages import (
@@ -26,6 +28,7 @@ from endo3d.services.runtime import service
 from endo3d.services.runtime.errors import UserError
 from endo3d_core import patterns, triangulation
 from endo3d_core.binning import BINS
+from endo3d_core.bow import Bow
 from endo3d_core.calibration import Lens, Rig
 from endo3d_core.conventional import Conventional
 from endo3d_core.fibre import CoreMap
@@ -54,7 +57,7 @@ class DecoderConfig(service.Config):
     default the one that the head's file names (``head: fibre: core_map:``, beside it)."""
     bin_px: Literal[1, 2, 4] | None = None
     """Camera pixels per grid step; by default as many as make a grid of about the fibre's resolution."""
-    form: Form = "reuse"
+    form: Form = Field("reuse", validation_alias=AliasChoices("form", "mode"))
     """How the continuous mode is decoded."""
     z_min_mm: float | None = None
     z_max_mm: float | None = None
@@ -84,6 +87,7 @@ class Decoder(service.Service[DecoderConfig]):
         self._camera: CameraCalibration | None = None
         self._projector: ProjectorCalibration | None = None
         self._decoders: dict[tuple[str, tuple[int, ...], str], Interleaved | Conventional] = {}
+        self._lookups: dict[tuple[int, int, int, patterns.Axis], triangulation.Lookup] = {}
         self._current: Interleaved | Conventional | None = None
         self._window: deque[tuple[int, int]] = deque(maxlen=8)
         self._last: tuple[int, int] | None = None
@@ -105,6 +109,7 @@ class Decoder(service.Service[DecoderConfig]):
         """Compile every kernel on a small image; with a core map on a whole one, whose operator takes long to make."""
         if self.rig is None:
             return
+        self._lookup(self.rig, self.config.bin_px or _bins_for(self.rig.camera.width), "columns")
         rig, bins = self.rig, [_bins_for(self.rig.camera.width)]
         if self._core_map is None:
             rig, bins = Rig(rig.camera.binned(8), rig.projector, rig.R, rig.t), [2, 4]
@@ -163,6 +168,12 @@ class Decoder(service.Service[DecoderConfig]):
         scale = (z_max - z_min) / DEPTH_STEPS
         channels = None if points is None else points.view(np.float32).reshape(*shape, CHANNELS)
         valid = decoder.decode(triangulation.output(channels, depth=depth, scale_mm=scale, offset_mm=z_min - scale))
+        if channels is not None and self._field is not None:
+            support = 0 if isinstance(decoder, Interleaved) else projector_field.SUPPORT
+            kept = self._kept.setdefault(shape, np.empty(shape, np.bool_))
+            valid = projector_field.keep(channels, self._limits_of(decoder), support, kept)
+            if depth is not None:
+                projector_field.blank(depth, kept)
         self._counts["valid_share"] = valid / (shape[0] * shape[1])
         grid_px = float(decoder.bin_px)
         if points is not None:
@@ -188,7 +199,7 @@ class Decoder(service.Service[DecoderConfig]):
             return None
         key = (frame.pattern_set, frame.image.shape, frame.image.dtype.str)
         if key not in self._decoders:
-            rig = Rig(_lens_of(self.rig.camera, frame), self.rig.projector, self.rig.R, self.rig.t)
+            rig = replace(self.rig, camera=_lens_of(self.rig.camera, frame))
             bin_px = self.config.bin_px or _bins_for(frame.image.shape[1])
             self._decoders[key] = self._build(frame.pattern_set, rig, bin_px, frame.image.dtype)
         decoder = self._decoders[key]
@@ -202,7 +213,7 @@ class Decoder(service.Service[DecoderConfig]):
     ) -> Interleaved | Conventional:
         pattern_set = patterns.parse(text)
         front, sensor, saturation_grey = self._front(rig, bin_px, dtype)
-        lookup = triangulation.build(rig, bin_px, *self.z_range_mm, pattern_set.axis)
+        lookup = self._lookup(rig, bin_px, pattern_set.axis)
         dark_grey = self.config.dark_grey * float(np.iinfo(dtype).max) / 255.0
         if pattern_set.kind == "interleaved":
             return Interleaved(
@@ -213,6 +224,13 @@ class Decoder(service.Service[DecoderConfig]):
             pattern_set, lookup, bin_px, dtype, front=front, dark_grey=dark_grey, saturation_grey=saturation_grey,
             sensor=sensor,
         )  # fmt: skip
+
+    def _lookup(self, rig: Rig, bin_px: int, axis: patterns.Axis) -> triangulation.Lookup:
+        """Of a camera format: frames would be lost while it is made, so it is made before the first and kept."""
+        key = rig.camera.width, rig.camera.height, bin_px, axis
+        if key not in self._lookups:
+            self._lookups[key] = triangulation.build(rig, bin_px, *self.z_range_mm, axis)
+        return self._lookups[key]
 
     def _front(
         self, rig: Rig, bin_px: int, dtype: np.dtype[np.uint8] | np.dtype[np.uint16]
@@ -239,8 +257,10 @@ class Decoder(service.Service[DecoderConfig]):
             Lens(projector.width, projector.height, projector.K, projector.dist),
             T[:3, :3],
             T[:3, 3],
+            Bow.from_yaml(projector.yaml),
         )
         self._calibrate(rig, projector.yaml)
+        self._lookup(rig, self.config.bin_px or _bins_for(rig.camera.width), "columns")
 
     def _calibrate(self, rig: Rig, yaml: str) -> None:
         """Take a calibration, unless it is the one in use: then the windows go on."""
@@ -252,6 +272,7 @@ class Decoder(service.Service[DecoderConfig]):
             return
         self.rig, self.z_range_mm = rig, (z_min, z_max)
         self._decoders.clear()
+        self._lookups.clear()
         self._current = None
 
 

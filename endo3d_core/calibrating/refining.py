@@ -7,6 +7,8 @@ feature, by least squares with a background, a contrast, and a slope of both (Lu
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +22,8 @@ TEXELS = 96
 """Of the drawn board per pitch."""
 FINER = 4
 """Samples per side of a texel."""
+MARGIN = 2
+"""Pitches that are drawn around the outermost features."""
 ITERATIONS = 3
 WINDOW = 0.5
 """Radius around a feature, of the pitch: neighbours share no sample, so their errors are independent."""
@@ -32,16 +36,9 @@ class Drawing:
     """A board to be looked up anywhere in its plane: 1 white, 0 black."""
 
     def __init__(self, board: Board, blur_mm: float) -> None:
-        low, high = board.points_mm.min(axis=0)[:2], board.points_mm.max(axis=0)[:2]
         self._per_mm = TEXELS / board.pitch_mm
-        self._low = low - 2 * board.pitch_mm
-        columns, rows = np.ceil((high - low + 4 * board.pitch_mm) * self._per_mm).astype(int)
-        x, y = (
-            (np.arange(n * FINER) + 0.5) / FINER / self._per_mm + start
-            for n, start in ((columns, self._low[0]), (rows, self._low[1]))
-        )
-        dark = board.dark(x, y[:, None]).reshape(rows, FINER, columns, FINER).mean(axis=(1, 3), dtype=np.float32)
-        self._white = cv2.GaussianBlur(1.0 - dark, (0, 0), max(blur_mm * self._per_mm, 0.3))
+        self._low = board.points_mm.min(axis=0)[:2] - MARGIN * board.pitch_mm
+        self._white = cv2.GaussianBlur(_sharp(board), (0, 0), max(blur_mm * self._per_mm, 0.3))
 
     def __call__(self, plane_mm: Vector) -> NDArray[np.float32]:
         """(n, 2) -> (n,)."""
@@ -49,6 +46,20 @@ class Drawing:
         return np.asarray(
             cv2.remap(self._white, at[:, :1], at[:, 1:], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).ravel()
         )
+
+
+@lru_cache(maxsize=1)
+def _sharp(board: Board) -> NDArray[np.float32]:
+    """(rows, columns) texels of 0..1, the same for every pose."""
+    step = board.pitch_mm / TEXELS
+    low, high = board.points_mm.min(axis=0)[:2], board.points_mm.max(axis=0)[:2]
+    columns, rows = np.ceil((high - low + 2 * MARGIN * board.pitch_mm) / step).astype(int)
+    x, y = (
+        (np.arange(n * FINER) + 0.5) * (step / FINER) + start - MARGIN * board.pitch_mm
+        for n, start in ((columns, low[0]), (rows, low[1]))
+    )
+    dark = board.dark(x, y[:, None]).reshape(rows, FINER, columns, FINER)
+    return np.asarray(1.0 - dark.mean(axis=(1, 3), dtype=np.float32))
 
 
 class PlaneMap:
