@@ -168,12 +168,6 @@ class Decoder(service.Service[DecoderConfig]):
         scale = (z_max - z_min) / DEPTH_STEPS
         channels = None if points is None else points.view(np.float32).reshape(*shape, CHANNELS)
         valid = decoder.decode(triangulation.output(channels, depth=depth, scale_mm=scale, offset_mm=z_min - scale))
-        if channels is not None and self._field is not None:
-            support = 0 if isinstance(decoder, Interleaved) else projector_field.SUPPORT
-            kept = self._kept.setdefault(shape, np.empty(shape, np.bool_))
-            valid = projector_field.keep(channels, self._limits_of(decoder), support, kept)
-            if depth is not None:
-                projector_field.blank(depth, kept)
         self._counts["valid_share"] = valid / (shape[0] * shape[1])
         grid_px = float(decoder.bin_px)
         if points is not None:
