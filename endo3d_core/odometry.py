@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from endo3d_core import health, rigid
 from endo3d_core.live_view import POOL, LiveView
 from endo3d_core.merging import SETTLED, MergedMap
-from endo3d_core.recovery import WIDEST_CELLS, Search, believable, convincing, nudged
+from endo3d_core.recovery import WIDEST_CELLS, Search, believable, convincing, nearby, nudged
 from endo3d_core.registration import Frame6, Linearisation, NormalEquations, Scales, visible_surface
+from endo3d_core.submaps import Submaps
 
 Array = NDArray[np.float64]
 
@@ -30,6 +31,8 @@ _STRAYED = 4.0
 """A last step larger than this, in point sigmas, has not converged: the result does not hold."""
 _PATIENCE, _PATIENCE_YOUNG = 30, 5
 """Clouds that may fail to recover before a new submap begins; a map of few clouds is soon replaced."""
+_LOOK_BACK = 8
+"""Two of so many clouds are looked for in older submaps, the second to confirm the first."""
 _LEAST_TEXTURE = 0.001
 """Relative brightness: far below any camera's noise, it keeps the robust scale from being zero."""
 _LONGEST_GAP = 6.0
@@ -66,6 +69,7 @@ class Odometry:
     def __init__(self, merging_distance_mm: float = 0.075, capacity: int = 1_000_000) -> None:
         self.map = MergedMap(merging_distance_mm, capacity)
         self.view = LiveView()
+        self.submaps = Submaps(capacity)
         self._equations = Linearisation()
         self.reset()
 
@@ -79,7 +83,8 @@ class Odometry:
         self._scale_mm = np.nan
         self._texture_scale = 0.1
         self._tilt_rad = 0.0
-        self.submap = 0
+        self.submaps.clear()
+        self.submap = self._begun = 0
         self._failures = 0
         self._search: Search | None = None
         self._merged = 0
@@ -97,7 +102,20 @@ class Odometry:
         estimate = known or self._recover(stamp_ns)
         if estimate.state is not State.LOST and estimate.state is not State.RELOCALISED:
             self._merge(sequence)
+            self.submaps.follow(self.T_world_camera, self.view)
+            if len(self.submaps) and self._merged % _LOOK_BACK < 2:
+                return self._look_back(estimate)
         return estimate
+
+    def _look_back(self, estimate: Estimate) -> Estimate:
+        """In an older submap, if the camera is back there."""
+        found = self.submaps.look(self.T_world_camera, self.view, self._equations)
+        if found is None:
+            return estimate
+        self.submaps.rejoin(found, self.map)
+        self.submap, self.T_world_camera = found.submap.number, found.T_older_newer @ self.T_world_camera
+        self._visible = nearby(self.map, self.T_world_camera, visible_surface(self.view.live))
+        return replace(estimate, T_world_camera=self.T_world_camera, state=State.RELOCALISED, submap=self.submap)
 
     def _merge(self, sequence: int) -> None:
         self.map.merge(self.view.live, self.T_world_camera, sequence)
@@ -105,7 +123,8 @@ class Odometry:
         self._merged += 1
 
     def _forget(self) -> None:
-        """Nothing of the old map helps any more."""
+        """A new submap begins; the way back into the old one stays open."""
+        self.submaps.leave(self.submap, self.map)
         self.map.clear()
 
     def _load(self, channels: NDArray[np.float32]) -> int:
@@ -164,8 +183,9 @@ class Odometry:
                 return replace(estimate, state=State.RELOCALISED)
         self._failures += 1
         if self._failures > (_PATIENCE_YOUNG if self._is_young else _PATIENCE):
-            self.submap += 1
             self._forget()
+            self._begun += 1
+            self.submap = self._begun
             return self._begin(stamp_ns)
         return self._lost()
 

@@ -10,7 +10,7 @@ best is registered in earnest. What does not convince is refused.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from endo3d_core import health, rigid
 from endo3d_core.compiled import kernel
 from endo3d_core.live_view import LiveView
-from endo3d_core.merging import CONFIRMED, COUNT, MergedMap
+from endo3d_core.merging import CONFIRMED, COUNT
 from endo3d_core.pooling import TEXTURE, Z
-from endo3d_core.registration import Frame6, Linearisation, NormalEquations, Scales, visible_surface
+from endo3d_core.registration import Frame6, Linearisation, NormalEquations, Points, Scales, visible_surface
 
 Array = NDArray[np.float64]
 
@@ -51,10 +51,18 @@ WORST_RESIDUAL = 2.8
 without; 3.4 to 9 when a fifth of a millimetre off (texture of 5 % and more)."""
 
 
+class World(Points, Protocol):
+    """Map points to search in."""
+
+    @property
+    def used(self) -> int:
+        """Rows from there on are empty."""
+
+
 class Search:
     """One loss: where was looked already, and the map points to compare with (a lost camera adds none)."""
 
-    def __init__(self, world: MergedMap, T_last: Array, view: LiveView, *, young: bool = False) -> None:
+    def __init__(self, world: World, T_last: Array, view: LiveView, *, young: bool = False) -> None:
         """``young``: hardly a map point has been seen often, so all of them have to do."""
         frame = visible_surface(view.live)
         self._world = world
@@ -123,7 +131,7 @@ def _agrees(n: NormalEquations, least_share: float, least_slope: float) -> bool:
     return in_place and not (n.textured_scene and n.texture_slope < least_slope)
 
 
-def nearby(world: MergedMap, T_last: Array, frame: Frame6, at_least: int = CONFIRMED) -> NDArray[np.int32]:
+def nearby(world: World, T_last: Array, frame: Frame6, at_least: int = CONFIRMED) -> NDArray[np.int32]:
     """At most ``REGISTERED_POINTS`` rows, evenly, of map points that the search could bring into view.
 
     Of those measured ``at_least`` so many times.
@@ -162,7 +170,7 @@ def _around(reach_mm: float, step_mm: float) -> Array:
     return out
 
 
-def nudged(T: Array, world: MergedMap, rows: NDArray[np.int32], view: LiveView) -> Array:
+def nudged(T: Array, world: Points, rows: NDArray[np.int32], view: LiveView) -> Array:
     """``T``, or the pose near by in which the cloud clearly looks more like the map: a bad prediction of a hand leads
     registration into the nearest detail that looks alike."""
     poses = T @ _around(NUDGE_CELLS * view.pitch_mm, view.pitch_mm)

@@ -111,10 +111,13 @@ def _middle(live: Any, stride: int) -> Any:
 class Points(Protocol):
     """Map points to register to: a merged map, or a part of an old one."""
 
-    rows: NDArray[np.float32]
-    """(n, ROW), as ``merging`` lays them out."""
-    ints: NDArray[np.int32]
-    """The same bytes."""
+    @property
+    def rows(self) -> NDArray[np.float32]:
+        """(n, ROW), as ``merging`` lays them out."""
+
+    @property
+    def ints(self) -> NDArray[np.int32]:
+        """The same bytes."""
 
 
 class Linearisation:

@@ -112,6 +112,19 @@ def test_a_camera_that_stays_lost_begins_a_new_submap() -> None:
     assert estimates[-1].state == State.TRACKING
 
 
+def test_a_camera_that_comes_back_rejoins_the_submap_it_left() -> None:
+    odometry, _, _ = jump("blade", (9.0, 0.0, 0.0), clouds=40)
+    assert odometry.submap == 1
+    caster, home = sim.Caster(sim.blade(), SMALL), sim.HandMotion().pose(0.1)
+    estimates = [odometry.track(caster.cast(home, 2000 + k), 2000 + k, 10**9 + k * 5_800_000) for k in range(90)]
+    assert odometry.submap == 0
+    back = [e.submap for e in estimates].index(0)
+    assert estimates[back].state == State.RELOCALISED
+    assert {e.state for e in estimates[back + 1 :]} == {State.TRACKING}
+    expected = rigid.inverse(sim.HandMotion().pose(0.0)) @ home
+    assert 1e3 * np.linalg.norm(estimates[-1].T_world_camera[:3, 3] - expected[:3, 3]) < 20.0
+
+
 def test_a_search_does_a_bounded_share_of_its_work_per_cloud(monkeypatch: pytest.MonkeyPatch) -> None:
     rows: list[int] = []
     at = Linearisation.at
