@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import AliasChoices, Field
 
 from endo3d.schemas import topics
@@ -35,6 +36,7 @@ from endo3d_core.fibre import CoreMap
 from endo3d_core.fibre_operator import FibreOperator, FibreSensor
 from endo3d_core.head import Head
 from endo3d_core.interleaved import Form, Interleaved
+from endo3d_core.projector_field import SUPPORT, ProjectorField, depth_limits
 from endo3d_core.uncertainty import Sensor
 
 GRID_WIDTH = 480
@@ -89,6 +91,9 @@ class Decoder(service.Service[DecoderConfig]):
         self._decoders: dict[tuple[str, tuple[int, ...], str], Interleaved | Conventional] = {}
         self._lookups: dict[tuple[int, int, int, patterns.Axis], triangulation.Lookup] = {}
         self._current: Interleaved | Conventional | None = None
+        self._head: Head | None = None
+        self._limits: dict[tuple[int, int, int], NDArray[np.float32]] = {}
+        self._fields: dict[Interleaved | Conventional, ProjectorField] = {}
         self._window: deque[tuple[int, int]] = deque(maxlen=8)
         self._last: tuple[int, int] | None = None
         self._counts = {"windows_dropped": 0.0, "valid_share": 0.0}
@@ -120,7 +125,10 @@ class Decoder(service.Service[DecoderConfig]):
                 points = np.empty((decoder.lookup.height, decoder.lookup.width, CHANNELS), np.float32)
                 for k in range(decoder.frames):
                     decoder.push(image, k % len(patterns.parse(text)))
-                decoder.decode(triangulation.output(points, depth=np.empty(points.shape[:2], np.uint16)))
+                depth = np.empty(points.shape[:2], np.uint16)
+                decoder.decode(triangulation.output(points, depth=depth))
+                if decoder in self._fields:
+                    self._fields.pop(decoder).keep(points, depth)
 
     def step(self, message: Message) -> Iterator[Message]:
         match message:
@@ -168,6 +176,9 @@ class Decoder(service.Service[DecoderConfig]):
         scale = (z_max - z_min) / DEPTH_STEPS
         channels = None if points is None else points.view(np.float32).reshape(*shape, CHANNELS)
         valid = decoder.decode(triangulation.output(channels, depth=depth, scale_mm=scale, offset_mm=z_min - scale))
+        field = self._fields.get(decoder)
+        if field is not None and channels is not None:
+            valid = field.keep(channels, depth)
         self._counts["valid_share"] = valid / (shape[0] * shape[1])
         grid_px = float(decoder.bin_px)
         if points is not None:
@@ -209,21 +220,31 @@ class Decoder(service.Service[DecoderConfig]):
         front, sensor, saturation_grey = self._front(rig, bin_px, dtype)
         lookup = self._lookup(rig, bin_px, pattern_set.axis)
         dark_grey = self.config.dark_grey * float(np.iinfo(dtype).max) / 255.0
+        decoder: Interleaved | Conventional
         if pattern_set.kind == "interleaved":
-            return Interleaved(
+            decoder = Interleaved(
                 pattern_set, lookup, bin_px, dtype, form=self.config.form, fit=self.config.fit, front=front,
                 dark_grey=dark_grey, saturation_grey=saturation_grey, sensor=sensor,
             )  # fmt: skip
-        return Conventional(
-            pattern_set, lookup, bin_px, dtype, front=front, dark_grey=dark_grey, saturation_grey=saturation_grey,
-            sensor=sensor,
-        )  # fmt: skip
+        else:
+            decoder = Conventional(
+                pattern_set, lookup, bin_px, dtype, front=front, dark_grey=dark_grey, saturation_grey=saturation_grey,
+                sensor=sensor,
+            )  # fmt: skip
+        if self._head is not None:
+            # The continuous mode has compared neighbours already.
+            support = 0 if isinstance(decoder, Interleaved) else SUPPORT
+            limits = self._limits[rig.camera.width, rig.camera.height, bin_px]
+            self._fields[decoder] = ProjectorField(limits, support)
+        return decoder
 
     def _lookup(self, rig: Rig, bin_px: int, axis: patterns.Axis) -> triangulation.Lookup:
         """Of a camera format: frames would be lost while it is made, so it is made before the first and kept."""
         key = rig.camera.width, rig.camera.height, bin_px, axis
         if key not in self._lookups:
             self._lookups[key] = triangulation.build(rig, bin_px, *self.z_range_mm, axis)
+            if self._head is not None:
+                self._limits[key[:3]] = depth_limits(rig, self._head, bin_px, *self.z_range_mm)
         return self._lookups[key]
 
     def _front(
@@ -259,14 +280,18 @@ class Decoder(service.Service[DecoderConfig]):
     def _calibrate(self, rig: Rig, yaml: str) -> None:
         """Take a calibration, unless it is the one in use: then the windows go on."""
         z_min, z_max = self.config.z_min_mm, self.config.z_max_mm
-        if z_min is None or z_max is None:
-            head = Head.from_yaml(yaml)
+        head = Head.from_yaml(yaml) if "head:" in yaml or z_min is None or z_max is None else None
+        if head is not None:
             z_min, z_max = z_min or head.z_min_mm, z_max or head.z_max_mm
+        assert z_min is not None
+        assert z_max is not None
         if self.rig is not None and rig.to_yaml() == self.rig.to_yaml() and self.z_range_mm == (z_min, z_max):
             return
-        self.rig, self.z_range_mm = rig, (z_min, z_max)
+        self.rig, self.z_range_mm, self._head = rig, (z_min, z_max), head
         self._decoders.clear()
         self._lookups.clear()
+        self._limits.clear()
+        self._fields.clear()
         self._current = None
 
 
