@@ -40,7 +40,8 @@ def _scan(hosts: Hosts, seconds: float) -> str:
     rig, far = hosts.witness["rig"], hosts.witness["workstation"]
     began_s = time.monotonic()
     try:
-        far.until(lambda now: all(now["counts"].get(topic) for topic in TOPICS), START_LIMIT_S)
+        for witness in (rig, far):
+            witness.until(lambda now: all(now["counts"].get(topic) for topic in TOPICS), START_LIMIT_S)
     except TimeoutError as error:
         raise SystemExit(f"{error}\n{hosts.log('rig')}\n{hosts.log('workstation')}") from None
     start_s = time.monotonic() - began_s

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import signal
+from contextlib import suppress
+from enum import StrEnum
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -15,10 +17,16 @@ if TYPE_CHECKING:
 COLOURS = ("cyan", "green", "magenta", "yellow", "blue", "bright_red", "bright_cyan", "bright_green")
 
 
+class LogFormat(StrEnum):
+    TEXT = "text"
+    JSON = "json"
+
+
 def up(
     stack: StackArgument,
     overrides: SetOption = None,
     host: HostOption = "",
+    log: Annotated[LogFormat, typer.Option("--log", help="For people, or a JSON object per event.")] = LogFormat.TEXT,
     seconds: Annotated[float, typer.Option("--seconds", help="Stop after that long; 0 runs on.")] = 0.0,
 ) -> None:
     """Start every service of a stack file, and keep them running.
@@ -31,13 +39,15 @@ def up(
     from endo3d.services.runtime import graph, stack_file
     from endo3d.services.runtime.errors import UserError
     from endo3d.services.runtime.launcher import Launcher, children_of
+    from endo3d.services.runtime.log import FORMAT_VARIABLE
     from endo3d.services.runtime.notify import Notifier
 
     described = stack_file.load(stack, overrides or ()).on(host)
     graph.of(described)
     asked, systemd = Asked(), Notifier()
     names = list(described.share().values())
-    with Launcher(children_of(described, overrides or ()), log_printer(names)) as launcher:
+    sink = json_printer(host) if log is LogFormat.JSON else log_printer(names)
+    with Launcher(children_of(described, overrides or ()), sink, {FORMAT_VARIABLE: str(log)}) as launcher:
         launcher.start()
         systemd.ready(f"started {', '.join(names)}")
         while not (launcher.done or asked.times or (seconds and asked.after(seconds))):
@@ -48,6 +58,21 @@ def up(
     if launcher.user_error:
         raise UserError(launcher.user_error)
     raise typer.Exit(launcher.exit_code)
+
+
+def json_printer(host: str) -> Callable[[str, str], None]:
+    """Prints (service, line) as a JSON object a line; what is no event, e.g. the launcher's words, becomes one."""
+    import json
+    import sys
+
+    def show(service: str, line: str) -> None:
+        event: object = None
+        with suppress(ValueError):
+            event = json.loads(line)
+        where = {"host": host, "service": service} if host else {"service": service}
+        print(json.dumps({**where, **(event if isinstance(event, dict) else {"message": line})}), file=sys.stderr)
+
+    return show
 
 
 class Asked:

@@ -1,7 +1,8 @@
-"""Log records of a process become log lines on the bus, and plain lines on stderr."""
+"""Log records of a process become log lines on the bus, and lines on stderr: for people, or JSON for programs."""
 
 from __future__ import annotations
 
+import json
 import logging
 import os
 import sys
@@ -16,9 +17,34 @@ _PER_SECOND: Final = 20
 """More lines than this are counted instead of sent: a failing step must not flood the bus."""
 
 
+FORMAT_VARIABLE: Final = "ENDO3D_LOG"
+"""Environment variable: ``json`` for one JSON object per event, tracebacks inside it."""
+
+
 def to_stderr(level: int = logging.INFO) -> None:
-    """``LEVEL message``, one line per event; the launcher adds the service's name."""
-    logging.basicConfig(stream=sys.stderr, level=level, format="%(levelname)s %(message)s", force=True)
+    """``LEVEL message``, or JSON; the launcher adds the service's name."""
+    handler = logging.StreamHandler(sys.stderr)
+    as_json = os.environ.get(FORMAT_VARIABLE) == "json"
+    handler.setFormatter(JsonFormatter() if as_json else logging.Formatter("%(levelname)s %(message)s"))
+    logging.basicConfig(level=level, handlers=[handler], force=True)
+
+
+class JsonFormatter(logging.Formatter):
+    """An event as a JSON object on one line, its time in UTC."""
+
+    converter = staticmethod(time.gmtime)
+
+    def format(self, record: logging.LogRecord) -> str:
+        event: dict[str, object] = {
+            "time": f"{self.formatTime(record, '%Y-%m-%dT%H:%M:%S')}.{int(record.msecs):03}Z",
+            "level": str(_level(record.levelno)),
+            "message": record.getMessage(),
+            "file": os.path.basename(record.pathname),
+            "line": record.lineno,
+        }
+        if record.exc_info:
+            event["exception"] = self.formatException(record.exc_info)
+        return json.dumps(event)
 
 
 class BusHandler(logging.Handler):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import math
 import os
 import signal
@@ -67,6 +68,40 @@ def test_systemd_hears_ready_alive_and_stopping(systemd: socket.socket, tmp_path
         up.kill()
         up.wait()
         systemd.close()
+
+
+def test_logs_are_one_json_object_per_event(tmp_path: Path) -> None:
+    """The services', tracebacks too, and the launcher's own; no other line."""
+    (tmp_path / "failing.py").write_text(
+        "from endo3d.services.runtime.service import Config, Service\n"
+        "class Failing(Service[Config]):\n"
+        "    def warm(self):\n"
+        "        raise RuntimeError('no\\nluck')\n"
+    )
+    (tmp_path / "package").mkdir()
+    (tmp_path / "failing.py").rename(tmp_path / "package" / "failing.py")
+    (tmp_path / "stack.toml").write_text(f'[rig]\nname = "{rig_of("json")}"\n[broken]\nmodule = "package.failing"\n')
+    up = subprocess.Popen(
+        [sys.executable, "-m", "endo3d.services.cli.app", "up", "stack.toml", "--log", "json"],
+        cwd=tmp_path,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert up.stderr is not None
+    try:
+        events = []
+        for line in up.stderr:
+            events.append(json.loads(line))
+            if "restart 1 of" in events[-1]["message"]:
+                break
+    finally:
+        up.kill()
+        up.stderr.close()
+        up.wait()
+    assert {event["service"] for event in events} == {"broken"}
+    failure = next(event for event in events if event.get("level") == "error")
+    assert "RuntimeError: no\nluck" in failure["exception"]
+    assert failure["file"] == "run.py"
 
 
 def test_nothing_is_said_where_nobody_asks() -> None:
