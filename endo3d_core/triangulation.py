@@ -85,9 +85,12 @@ def build(rig: Rig, bin_px: int, z_min_mm: float, z_max_mm: float, axis: Axis = 
     scale = np.abs(offset).max()
     if not np.isfinite(scale):
         raise ValueError("the projector's lens model folds over inside the working volume")
-    powers = (offset / scale)[..., None] ** np.arange(4)
+    x = offset / scale
+    powers = np.stack((np.ones_like(x), x, x * x, x * x * x), axis=-1)
     corrected = inverse_z + rig.bow(rays[..., :1], rays[..., 1:2], inverse_z)
-    cubic = (np.linalg.pinv(powers) @ corrected[..., None])[..., 0] / scale ** np.arange(4)
+    # By the normal equations, which are tame on these nodes: a singular value decomposition takes ten times as long.
+    gram, moments = np.swapaxes(powers, -1, -2) @ powers, np.swapaxes(powers, -1, -2) @ corrected[..., None]
+    cubic = np.linalg.solve(gram, moments)[..., 0] / scale ** np.arange(4)
     planes = np.stack((centre, *np.moveaxis(cubic, -1, 0), rays[..., 0], rays[..., 1]))
     period = rig.projector.width if axis == "columns" else rig.projector.height
     return Lookup(
