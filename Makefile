@@ -4,7 +4,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 INSTALLED := .venv/installed
 
-.PHONY: help demo test check bench faults soak wheel clean
+.PHONY: help demo test check bench faults soak hosts wheel clean
 
 help:
 	@echo "make demo     scan the micro-contour standard on the virtual rig"
@@ -13,6 +13,7 @@ help:
 	@echo "make bench    the numbers, with this machine's name"
 	@echo "make faults   break everything in turn while a simulated scan runs (10 minutes)"
 	@echo "make soak     the whole stack at 172 Hz for MINUTES=30"
+	@echo "make hosts    a rig and a far host on good and bad links, in network namespaces (2 minutes)"
 	@echo "make wheel    build dist/endo3d-*.whl"
 
 $(INSTALLED): pyproject.toml deploy/constraints.txt
@@ -46,6 +47,9 @@ faults: $(INSTALLED)
 
 soak: $(INSTALLED)
 	$(BIN)/python -m bench.reliability.soak --minutes $(or $(MINUTES),30) $(ARGS)
+
+hosts: $(INSTALLED)
+	$(BIN)/python -m bench.hosts.run $(ARGS)
 
 wheel: $(INSTALLED)
 	@rm -rf build/lib  # a module that is gone would still get into the wheel

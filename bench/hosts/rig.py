@@ -88,7 +88,7 @@ class Hosts:
         """``topics``: what the witness on each host counts."""
         self.network = network
         self._topics = topics
-        self._folder = folder
+        self.folder = folder
         router = load(stack).placement.router
         shared = [f"rig.port={PORT}", f"rig.keys={folder / 'keys'}"]
         shared.append(f"hosts.{router}.address={network.address[router]}")
@@ -100,7 +100,7 @@ class Hosts:
         self.up: dict[str, subprocess.Popen[Any]] = {}
 
     def __enter__(self) -> Self:
-        keys = self._folder / "keys"
+        keys = self.folder / "keys"
         make_authority(keys, self.stack.rig.name, 2)
         for name, host in self.stack.placement.hosts.items():
             make_host(keys, keys, name, host.role, [self.network.address.get(name, name)], 2)
@@ -110,7 +110,7 @@ class Hosts:
 
     def start(self, name: str) -> None:
         """A host's share, and its witness if it has none yet."""
-        output = self._closing.enter_context((self._folder / f"{name}.log").open("ab"))
+        output = self._closing.enter_context((self.folder / f"{name}.log").open("ab"))
         endo3d = [sys.executable, "-m", "endo3d.services.cli.app", "up", str(self._file), "--host", name]
         self.up[name] = self.network.start(name, endo3d, stdout=output, stderr=subprocess.STDOUT)
         if name not in self.witness:
@@ -120,7 +120,7 @@ class Hosts:
 
     def log(self, name: str) -> str:
         """What a host's services said."""
-        return (self._folder / f"{name}.log").read_text(errors="replace")
+        return (self.folder / f"{name}.log").read_text(errors="replace")
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None

@@ -34,6 +34,14 @@ def test_a_thin_link_gives_a_live_map_and_picture(run: Run) -> None:
     assert {"source", "local", "relay-rig", "router", "remote", "relay-workstation"} <= set(run.far.now["services"])
 
 
+def test_no_secret_is_in_a_log_or_a_stack_file(run: Run) -> None:
+    folder = run.hosts.folder
+    secrets = [line for key in (folder / "keys").glob("*.key") for line in key.read_text().splitlines()[1:-1]]
+    written = (folder / "stack.toml").read_text() + run.hosts.log("rig") + run.hosts.log("workstation")
+    assert len(secrets) >= 6
+    assert not [secret for secret in secrets if secret in written]
+
+
 def test_who_may_not_is_told_so_from_afar(run: Run) -> None:
     """The command gets there and back: this service knows none."""
     assert "no command" in run.far.command("source", "dance")
