@@ -16,8 +16,8 @@ from endo3d_core.head import Head
 
 RIM_PITCHES = 2.5
 """The disc's rim, in core spacings: so far does light of the inside reach by crosstalk and blur."""
-STEP_PX, DEPTHS = 8, 48
-"""The limits are computed at every so many grid points and depths, linear between."""
+STEP_PX, DEPTHS = 32, 64
+"""The limits are computed at every so many camera pixels, linear between, and with so many depths."""
 NEIGHBOUR_MM = 0.15
 """Between neighbours of the grid; more is no surface that both modes can measure."""
 SUPPORT = 2
@@ -44,18 +44,19 @@ class ProjectorField:
 def depth_limits(rig: Rig, head: Head, bin_px: int, z_min_mm: float, z_max_mm: float) -> NDArray[np.float32]:
     """(2, height, width) nearest and farthest depth that the projector lights, of a binned camera's grid."""
     height, width = rig.camera.height // bin_px, rig.camera.width // bin_px
-    rows, columns = (-(-n // STEP_PX) + 1 for n in (height, width))
-    v, u = np.mgrid[0:rows, 0:columns] * STEP_PX * bin_px + 0.5 * (bin_px - 1)
+    step = STEP_PX / bin_px
+    rows, columns = (int(np.ceil(n / step)) + 1 for n in (height, width))
+    v, u = np.mgrid[0:rows, 0:columns] * STEP_PX + 0.5 * (bin_px - 1)
     rays = rig.camera.ray(np.stack((u, v), axis=-1).astype(np.float64))
     depths = np.linspace(z_min_mm, z_max_mm, DEPTHS)
     middle = np.array(((rig.projector.width - 1) / 2, (rig.projector.height - 1) / 2))
     pixels = rig.projector_pixel(rays[..., None, :] * depths[:, None]) - middle
     radius = head.projector_circle_px / 2 - RIM_PITCHES * head.projector_pitch_px
     lit = np.hypot(pixels[..., 0], pixels[..., 1]) <= radius
-    step = depths[1] - depths[0]
-    near = np.where(lit.any(axis=-1), depths[lit.argmax(axis=-1)] - 0.5 * step, z_max_mm + step)
-    far = np.where(lit.any(axis=-1), depths[DEPTHS - 1 - lit[..., ::-1].argmax(axis=-1)] + 0.5 * step, z_min_mm - step)
-    to_nodes = np.mgrid[0:height, 0:width].astype(np.float32) / STEP_PX
+    half = 0.5 * (depths[1] - depths[0])
+    near = np.where(lit.any(axis=-1), depths[lit.argmax(axis=-1)] - half, z_max_mm + half)
+    far = np.where(lit.any(axis=-1), depths[DEPTHS - 1 - lit[..., ::-1].argmax(axis=-1)] + half, z_min_mm - half)
+    to_nodes = np.mgrid[0:height, 0:width].astype(np.float32) / np.float32(step)
     return np.stack([
         cv2.remap(plane.astype(np.float32), to_nodes[1], to_nodes[0], cv2.INTER_LINEAR) for plane in (near, far)
     ])  # fmt: skip
