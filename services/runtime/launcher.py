@@ -77,7 +77,7 @@ def children_of(stack: Stack, overrides: Sequence[str] = ()) -> list[Child]:
     if stack.host:
         options += ["--host", stack.host]
     command = [sys.executable, "-m", "endo3d.services.cli.app", "run"]
-    share = stack.share()
+    share = stack.on(stack.host).share()
     return [
         Child(share[entry.name], [*command, entry.name, *options], entry.is_source, entry.kind.nice)
         for entry in stack.entries

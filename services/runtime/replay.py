@@ -21,6 +21,7 @@ from endo3d.services.archive.reader import Log, Record
 from endo3d.services.archive.recording import Recording
 from endo3d.services.runtime import stack_file
 from endo3d.services.runtime.errors import UserError
+from endo3d.services.runtime.hosts import RELAY, ROUTER
 from endo3d.services.runtime.service import Service, Source, Tap
 from endo3d.services.runtime.stack_file import Stack
 
@@ -123,8 +124,8 @@ def live_stack(
     played = {topics.FRAME, *CARRIED}
     for name, table in stack.tables.items():
         kind = stack.kind(name)
-        if not played.intersection(kind.writes) and not issubclass(kind, Tap):
-            tables[name] = table
+        if not played.intersection(kind.writes) and not issubclass(kind, Tap) and name not in (RELAY, ROUTER):
+            tables[name] = {key: value for key, value in table.items() if key != "host"}  # all on this one
     if out is not None:
         tables["recorder"] = {"directory": str(out.resolve().parent), "name": out.stem}
     tables["player"] = {

@@ -14,6 +14,7 @@ from endo3d.services.runtime import graph, hosts, stack_file
 from endo3d.services.runtime.errors import UserError
 from endo3d.services.runtime.launcher import children_of
 from endo3d.services.runtime.network import nested, router_settings
+from endo3d.services.runtime.replay import live_stack
 
 TWO = '[hosts.left]\nrole = "rig"\n[hosts.right]\nrole = "rig"\n'
 SHARED = 'host = ["left", "right"]'
@@ -99,6 +100,13 @@ def test_hosts_need_to_be_told_apart() -> None:
 def test_an_override_reaches_a_host() -> None:
     text = stack_of("bench").toml
     assert stack_file.loads(text, ["hosts.rig.port=7777"]).placement.endpoint == "tls/127.0.0.1:7777"
+
+
+def test_a_log_of_several_hosts_is_replayed_on_one(tmp_path: Path) -> None:
+    stack = stack_of("bench", hosts=TWO, decoder=SHARED)
+    live = stack_file.loads(live_stack(stack, tmp_path / "a.mcap", rate=1, loop=False, start_s=0, end_s=0, out=None))
+    assert list(live.tables) == ["player", "decoder", "odometry", "viewer"]
+    assert live.share() == {name: name for name in live.tables}
 
 
 def test_up_says_what_is_missing() -> None:
