@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections import Counter, deque
 from collections.abc import Iterator, Mapping
@@ -18,7 +19,10 @@ from endo3d.services.devices.uri import DeviceError, Setting
 from endo3d.services.runtime import service
 from endo3d.services.runtime.errors import UserError
 from endo3d.services.runtime.service import Exhausted, Source
+from endo3d_core.calibrating.quality import Quality
 from endo3d_core.calibration import Lens, Rig
+
+log = logging.getLogger(__name__)
 
 TURN_S = 0.004
 REOPEN_NS = 1_000_000_000
@@ -52,6 +56,7 @@ class Grabber(Source[GrabberConfig]):
         self.held: deque[Shot] = deque()
         self.lent = 0
         self.announced = False
+        self.quality = Quality("design")
         self.exposure_us: float | None = None
         self.note = ""
         self.gone = 0
@@ -73,6 +78,7 @@ class Grabber(Source[GrabberConfig]):
         try:
             self.yaml = Path(self.config.head).read_text(encoding="utf-8")
             self.connect()
+            self.quality = Quality.from_yaml(self.yaml)
         except OSError as error:
             raise UserError(f"head {self.config.head!r}: {error.strerror}; name a file of deploy/heads") from error
         except (DeviceError, ValueError) as error:
@@ -103,6 +109,8 @@ class Grabber(Source[GrabberConfig]):
     def poll(self, timeout_s: float) -> Iterator[Message]:
         if not self.announced:
             self.announced = True
+            # On the bus, so that every log that is made with this calibration names its state.
+            log.log(logging.WARNING if self.quality.state == "bad" else logging.INFO, self.quality.line)
             yield from self.calibration()
         if self._camera is None:
             self.look_for_camera(timeout_s)
@@ -147,8 +155,8 @@ class Grabber(Source[GrabberConfig]):
         camera, due_ns = self._camera, self.image_due_ns
         if camera is not None and due_ns is not None and (late_ns := camera.now_ns() - due_ns) > 0:
             silent_s = 1e-9 * (late_ns + self.patience_ns)
-            return f"no image for {silent_s:.0f} s though the projector runs; check the trigger's cable, and the lens cap"
-        return self.note
+            return f"no image for {silent_s:.0f} s though the projector runs; check the trigger's cable, the lens cap"
+        return self.note or (self.quality.line if self.quality.state == "bad" else "")
 
     def values(self) -> Mapping[str, float]:
         return {"camera_lost": float(self.gone)}

@@ -16,8 +16,9 @@ from endo3d_core.bow import NO_BOW
 from endo3d_core.calibrating import flat_reference
 from endo3d_core.calibrating.bundle import Solution
 from endo3d_core.calibrating.flat_reference import Flat
+from endo3d_core.calibrating.judging import depth_sigma_um, reasons
 from endo3d_core.calibrating.outliers import solve_without_outliers
-from endo3d_core.calibrating.quality import Quality, depth_sigma_um, reasons
+from endo3d_core.calibrating.quality import Quality
 from endo3d_core.calibrating.retina import FibreRetina, PixelRetina, Retina
 from endo3d_core.calibrating.seeing import View, covered, share_covered, sight
 from endo3d_core.calibrating.sighting import Sighting

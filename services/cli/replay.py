@@ -103,7 +103,20 @@ def replay(
         "digests": digests.as_dict() if digests else {},
         "files": [str(part) for part in into.parts] if into is not None else [],
     }
+    report["calibration"] = _calibration(first)
     print(json.dumps(report, indent=2) if as_json else _text(report))
+
+
+def _calibration(log: Log) -> str:
+    """How good the calibration is that the log was made with, in a line."""
+    from endo3d.schemas import topics
+    from endo3d.schemas.messages import ProjectorCalibration
+    from endo3d_core.calibrating.quality import Quality
+
+    for message in log.messages(topics.PROJECTOR):
+        if isinstance(message, ProjectorCalibration):
+            return Quality.from_yaml(message.yaml).line
+    return "calibration: none in this log"
 
 
 def _live(stack_toml: str) -> NoReturn:
@@ -149,6 +162,7 @@ def _text(report: dict[str, Any]) -> str:
         f"{report['recorded_s']:.2f} s of the log in {report['took_s']:.2f} s: "
         f"{report['times_real_time']:.1f} x real time"
     ]
+    lines.append(report["calibration"])
     for name, count in report["results"].items():
         lines.append(f"  {name:12s} {count:8d}  {report['digests'].get(name, '')}")
     return "\n".join(lines + [f"  wrote {name}" for name in report["files"]])
