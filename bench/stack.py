@@ -26,7 +26,7 @@ SCENE = "contour texture=noise:0.15:0.15"
 RATE_HZ, SECONDS = 172.0, 26.0
 GOAL_MS = 3 * 1e3 / RATE_HZ
 FRAMES = Path("build/bench/contour-172hz.mcap")
-READERS = ("decoder", "odometry", "recorder")
+SERVICES = ("player", "decoder", "odometry", "recorder", "viewer")
 
 
 def prerendered() -> Path:
@@ -57,7 +57,7 @@ def main() -> None:
     print(f"first cloud {run['start_s']:.1f} s after the command, then {run['scan_s']:.1f} s at {RATE_HZ:g} Hz")
     print(f"frames rendered {rendered}, recorded {counts['frame']}")
     print(f"clouds received {run['clouds']}, poses recorded {counts['pose']}")
-    for name in READERS:
+    for name in SERVICES:
         lost = run["lost"].get(name, {})
         said = ", ".join(f"{cause} {count}" for cause, count in lost.items()) or "nothing"
         print(f"lost in {name:<10} {said}")

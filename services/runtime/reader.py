@@ -57,11 +57,12 @@ class Reader(threading.Thread):
         self._expected: dict[tuple[zenoh.ZenohId, int], int] = {}
         self._chunks: weakref.WeakSet[Chunk] = weakref.WeakSet()
         self._subscriber = _subscribe(session, key, topic, 1 if self._newest else topic.depth)
+        self._ring = self._subscriber.handler  # fetched once: while it is undeclared nobody may touch a subscriber
 
     def run(self) -> None:
         with contextlib.suppress(zenoh.ZError):  # the ring is closed
             while True:
-                self._take(self._subscriber.handler.recv())  # in no variable: it would hold its memory
+                self._take(self._ring.recv())  # in no variable: it would hold its memory
                 if self._period_s and self._closing.wait(max(0.0, self._due_s - time.monotonic())):
                     break
 
