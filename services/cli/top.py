@@ -120,7 +120,8 @@ def _table(board: Board, rig: str) -> Table:
     rows = board.snapshot()
     ahead_ms = {status.host: status.values.get(CLOCK, 0.0) for status, _ in rows if CLOCK in status.values}
     table = Table(title=f"endo3d/{rig}", box=box.SIMPLE_HEAD, title_justify="left", expand=True)
-    for name in ("host", "service", "state"):
+    several = len({status.host for status, _ in rows}) > 1
+    for name in ("host", "service", "state") if several else ("service", "state"):
         table.add_column(name, no_wrap=True)
     for name in ("rate Hz", "p50 ms", "p99 ms", "CPU %", "MB"):
         table.add_column(name, justify="right", no_wrap=True)
@@ -130,7 +131,7 @@ def _table(board: Board, rig: str) -> Table:
         lost = ", ".join(f"{cause} {count}" for cause, count in status.dropped.items() if count)
         late_ms = ahead_ms.get(status.host, 0.0)
         table.add_row(
-            status.host,
+            *([status.host] if several else []),
             status.service,
             Text(state, STATE_STYLES.get(state, "red")),
             f"{status.rate_hz:.1f}",
