@@ -102,7 +102,8 @@ class Odometry:
         estimate = known or self._recover(stamp_ns)
         if estimate.state is not State.LOST and estimate.state is not State.RELOCALISED:
             self._merge(sequence)
-            self.submaps.follow(self.T_world_camera, self.view)
+            if self._merged % _LOOK_BACK == 0:
+                self.submaps.follow(self.T_world_camera, self.view)
             if len(self.submaps) and self._merged % _LOOK_BACK < 2:
                 return self._look_back(estimate)
         return estimate
@@ -196,6 +197,7 @@ class Odometry:
         T, rows = predicted, self._visible
         if self._is_young or self._is_stale(stamp_ns):
             T = nudged(predicted, self.map, rows, view)
+        surprised_mm = float(np.linalg.norm(T[:3, 3] - predicted[:3, 3]))
         gate_mm = 8.0 * self._scale_mm + view.pitch_mm
         tilt_rad = max(self._tilt_rad, view.normal_rad)
         scales = Scales(gate_mm, 0.5 * gate_mm, 4.0 * self._texture_scale, tilt_rad)
@@ -217,9 +219,9 @@ class Odometry:
             scales = Scales(8.0 * scale_mm, scale_mm, texture_scale, self._tilt_rad)
             steps += 1
             moved_mm = float(np.linalg.norm(solution.step))
+            surprised_mm += moved_mm
             if steps > 1 and moved_mm < _CONVERGED * sigma_mm:
                 break
-        surprised_mm = float(np.linalg.norm(health.scaled_twist(rigid.inverse(predicted) @ T, frame)))
         if surprised_mm > view.pitch_mm or self._is_stale(stamp_ns) or (self._is_young and solution.held.size):
             holds = convincing(n, view.texture_noise)
         else:

@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 
 _SPACING = 0.25
 """Poses of a path are kept so far apart, in radii of the visible surface: one look reaches twice as far."""
-_LONGEST_PATH = 400
+_LONGEST_PATH = 200
 _SAME_CELLS = 3.0
 """Both clouds have to say the same of where the submaps lie, to so many pooled cells."""
 
@@ -72,10 +72,9 @@ class Submaps:
 
     def follow(self, T_world_camera: Array, view: LiveView) -> None:
         """Remembers where the present submap was seen from."""
-        radius_mm = visible_surface(view.live).radius_mm
-        if len(self._path) < _LONGEST_PATH and all(
-            np.linalg.norm(T[:3, 3] - T_world_camera[:3, 3]) > _SPACING * radius_mm for T in self._path[-50:]
-        ):
+        apart_mm = _SPACING * visible_surface(view.live).radius_mm
+        near = any(np.linalg.norm(T[:3, 3] - T_world_camera[:3, 3]) < apart_mm for T in self._path)
+        if not near and len(self._path) < _LONGEST_PATH:
             self._path.append(T_world_camera)
 
     def leave(self, number: int, world: MergedMap) -> None:
