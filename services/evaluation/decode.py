@@ -33,6 +33,7 @@ CASES: tuple[tuple[str, str, tuple[float, float, float]], ...] = (
     ),
     ("texture, still", PLANE + " texture=checker:0.5:1", (0.0, 0.0, 0.0)),
     ("steps, still", "steps heights=0.05/0.1/0.2/0.5 width=1.5", (0.0, 0.0, 0.0)),
+    ("step of 0.5 mm, still", "steps heights=0.5 width=2 at=-1,0,20", (0.0, 0.0, 0.0)),
     ("sphere R 1 mm, still", "sphere r=1 at=0,0,20.6", (0.0, 0.0, 0.0)),
 )
 VARIANTS: tuple[tuple[str, Form, bool], ...] = (
@@ -44,6 +45,10 @@ VARIANTS: tuple[tuple[str, Form, bool], ...] = (
 WRONG_ORDER_MM = 0.8
 """Half a fringe order in depth."""
 SLOPE_MAX_DEG = 55.0
+LEFT_OUT = 0.003
+"""Share of the points that the standardised error leaves out, as VDI/VDE 2634 does."""
+STEP_REACH = 14
+"""Grid points on both sides of the step that its response is taken from."""
 
 
 def steps(quick: bool) -> int:
@@ -63,7 +68,7 @@ def evaluate(settings: Settings) -> Report:
     rows, figures = [], {}
     for done, (name, what, step_mm) in enumerate(_cases(settings.quick)):
         frames, poses = _render(rig, head, what, step_mm)
-        for variant, form, fit in VARIANTS:
+        for variant, form, fit in VARIANTS[: 2 if settings.quick else None]:
             decoder = Interleaved(patterns.parse(PATTERNS), lookup, 4, form=form, fit=fit)
             for k, frame in enumerate(frames):
                 decoder.push(frame, k % 4)
@@ -71,9 +76,10 @@ def evaluate(settings: Settings) -> Report:
             if decoder.slots.trusted and decoder.count >= decoder.frames:
                 decoder.points(points)
             known = truth.truth(rig, head, scene.parse(what, head.working_distance_mm), poses[-1 - decoder.latency], 4)
-            found = _compare(
-                points, np.where(known.visible, known.depth_mm, np.nan), "sphere" in name, poses[-1 - decoder.latency]
-            )
+            true_depth = np.where(known.visible, known.depth_mm, np.nan)
+            found = _compare(points, true_depth, "sphere" in name, poses[-1 - decoder.latency])
+            if name.startswith("step of"):
+                found["step_px"] = step_response_px(points[..., 2], true_depth)
             figures[f"{name}, {variant}"] = found
             rows.append((name, variant, *(f"{found[key]:.2f}" for key in _COLUMNS)))
         settings.progress(done + 1)
@@ -84,7 +90,9 @@ def evaluate(settings: Settings) -> Report:
             f"Head {HEAD}, `{PATTERNS}`, 1920x1200 at 8 bit with noise, fibres and defocus off, 4x4 bins. "
             "Depth against the truth on the grid, um; coverage and wrong fringe orders in per cent of the visible "
             "field, the error without the wrong orders. Of the sphere the "
-            f"slopes up to {SLOPE_MAX_DEG:g} degrees count, radius and form after a best fit."
+            f"slopes up to {SLOPE_MAX_DEG:g} degrees count, radius and form after a best fit. Error / sigma: standard "
+            f"deviation of the errors over their sigmas, {100 * LEFT_OUT:g} % left out. Across the step the way from "
+            "10 to 90 % of its height counts, gaps included."
         ],
         [Table("Depth error", ("case", "decoding", *_COLUMNS.values()), rows)],
         [],
@@ -97,8 +105,10 @@ _COLUMNS = {
     "wrong": "wrong orders %",
     "rms_um": "rms um",
     "bias_um": "bias um",
+    "error_sigma": "error / sigma",
     "radius_um": "radius um",
     "form_um": "form um",
+    "step_px": "10-90 % px",
 }
 
 
@@ -134,6 +144,8 @@ def _compare(
         radius_um, form_um = 1e3 * (fitted.radius_mm - 1.0), fitted.form_um
         error = np.where(chosen, error, np.nan)
         visible = chosen
+    standardised = (error / points[..., 5])[visible & np.isfinite(error)]
+    middle = np.abs(standardised) <= np.quantile(np.abs(standardised), 1.0 - LEFT_OUT) if standardised.size else []
     known = error[visible & np.isfinite(error)]
     wrong = np.abs(known) > WRONG_ORDER_MM
     right = known[~wrong] if (~wrong).any() else np.array([np.nan])
@@ -142,6 +154,33 @@ def _compare(
         "wrong": 100.0 * float(wrong.mean()) if known.size else float("nan"),
         "rms_um": 1e3 * float(np.sqrt(np.mean(right**2))),
         "bias_um": 1e3 * float(np.mean(right)),
+        "error_sigma": float(np.std(standardised[middle])) if standardised.size else float("nan"),
         "radius_um": radius_um,
         "form_um": form_um,
+        "step_px": float("nan"),
     }
+
+
+def step_response_px(depth: NDArray[np.float32], true_depth: NDArray[np.float64]) -> float:
+    """Grid points from 10 to 90 % of a step across the columns, median over the middle rows; gaps count."""
+    rows = slice(depth.shape[0] // 2 - 50, depth.shape[0] // 2 + 50)
+    reaches = []
+    for z, expected in zip(depth[rows], true_depth[rows], strict=True):
+        jump = int(np.nanargmax(np.abs(np.diff(_filled(expected)))))
+        around = z[jump - STEP_REACH : jump + STEP_REACH].astype(np.float64)
+        left, right = np.nanmedian(around[:5]), np.nanmedian(around[-5:])
+        at = np.flatnonzero(np.isfinite(around))
+        level = (around[at] - left) / (right - left)
+        high = int(np.argmax(level > 0.5))
+        begin = high - 1 - int(np.argmax(level[high - 1 :: -1] < 0.1))
+        end = high + int(np.argmax(level[high:] > 0.9))
+        first = np.interp(0.1, level[begin : begin + 2], at[begin : begin + 2])
+        last = np.interp(0.9, level[end - 1 : end + 1], at[end - 1 : end + 1])
+        reaches.append(last - first)
+    return float(np.median(reaches))
+
+
+def _filled(row: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Gaps take the value before them."""
+    known = np.maximum.accumulate(np.where(np.isfinite(row), np.arange(row.size), 0))
+    return np.nan_to_num(row[known], nan=float(np.nanmean(row)))

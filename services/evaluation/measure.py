@@ -55,7 +55,7 @@ class Clouds:
 
     def __init__(self, settings: Settings, run: VirtualRun, calibration_yaml: str) -> None:
         fibre = str(core_map(run.head_yaml, settings.folder)) if run.effects.camera_fibre else ""
-        self._decoder = Decoder(Decoder.Config(depth=False, fibre=fibre))
+        self._decoder = Decoder(Decoder.Config.model_validate({"depth": False, "fibre": fibre}))
         for message in run.calibration(calibration_yaml):
             list(self._decoder.step(message))
         self._truths: dict[int, Truth] = {}
