@@ -67,7 +67,7 @@ class Run:
         far_s = max(far_after["s"] - far["s"], 1e-3)
         published = rig_after["newest"]["pose"] - rig["newest"]["pose"]
         return Figures(
-            rig_hz=published / (rig_after["stamps_s"]["pose"] - rig["stamps_s"]["pose"]),
+            rig_hz=published / max(rig_after["stamps_s"]["pose"] - rig["stamps_s"]["pose"], 1e-9),
             rig_lost=sum(rig_after["skipped"][t] - rig["skipped"][t] for t in OWN),
             far_hz={t: (far_after["counts"].get(t, 0) - far["counts"].get(t, 0)) / far_s for t in TOPICS},
             far_age_ms=dict(far_after.get("age_ms", {})),

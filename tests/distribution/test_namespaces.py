@@ -11,12 +11,12 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from bench.hosts.namespaces import obstacle
-from bench.hosts.run import RIG_HZ, TOPICS, TROUBLES, Figures, Run, running
+from bench.hosts.run import TROUBLES, Figures, Run, running
 
 WHY_NOT = obstacle()
 pytestmark = [pytest.mark.net, pytest.mark.skipif(bool(WHY_NOT), reason=WHY_NOT)]
 
-BACK_S = 90.0
+LIMIT_S = 200.0
 
 
 @pytest.fixture(scope="module")
@@ -28,10 +28,14 @@ def run() -> Iterator[Run]:
 
 
 def test_a_thin_link_gives_a_live_map_and_picture(run: Run) -> None:
-    figures = run.measure(2.0)
-    assert all(figures.far_hz[topic] > 0 for topic in TOPICS)
+    run.until_it_gets_there(LIMIT_S)
     assert not any(run.far.now["backwards"].values()), "never back in time"
-    assert {"source", "local", "relay-rig", "router", "remote", "relay-workstation"} <= set(run.far.now["services"])
+
+
+def test_every_host_sees_the_services_of_all(run: Run) -> None:
+    everybody = {"source", "local", "relay-rig", "router", "remote", "relay-workstation"}
+    for witness in (run.rig, run.far):
+        witness.until(lambda now: everybody <= set(now["services"]), LIMIT_S)
 
 
 def test_no_secret_is_in_a_log_or_a_stack_file(run: Run) -> None:
@@ -42,14 +46,15 @@ def test_no_secret_is_in_a_log_or_a_stack_file(run: Run) -> None:
     assert not [secret for secret in secrets if secret in written]
 
 
-def test_who_may_not_is_told_so_from_afar(run: Run) -> None:
-    """The command gets there and back: this service knows none."""
-    assert "no command" in run.far.command("source", "dance")
+def test_a_command_gets_there_and_back(run: Run) -> None:
+    """This service knows none, and says so."""
+    assert any("no command" in run.far.command("source", "dance") for _ in range(5))
 
 
 @pytest.mark.parametrize("what", TROUBLES)
 def test_the_rig_goes_on_and_the_far_host_comes_back(run: Run, what: str) -> None:
     trouble: Callable[[Run, float], Figures] = TROUBLES[what]
-    figures = trouble(run, 2.0)
-    assert figures.rig_hz > RIG_HZ / 2
-    run.until_it_gets_there(BACK_S)
+    before = run.rig.count("pose")
+    trouble(run, 1.0)
+    run.rig.until(lambda now: now["counts"]["pose"] > before, LIMIT_S)
+    run.until_it_gets_there(LIMIT_S)
