@@ -10,7 +10,7 @@ import numpy as np
 from endo3d.services.evaluation import figures_of_merit as merit
 from endo3d.services.evaluation.cache import Cache, Result
 from endo3d.services.evaluation.calibrated import calibrated
-from endo3d.services.evaluation.measure import Merging, Settings, clouds, moved, points_of
+from endo3d.services.evaluation.measure import FIBRE, Merging, Settings, clouds, moved, points_of
 from endo3d.services.evaluation.report import Report, Table
 from endo3d.services.evaluation.virtual_run import VirtualRun, head_yaml
 from endo3d.services.views.figures import COLOURS, figure
@@ -151,7 +151,7 @@ def _report(
             f"`{MODES['continuous']}`, whose clouds are registered and merged at {MERGING_UM:g} um. "
             f"{len(next(iter(results.values())))} repetitions, each with the standard put down anew and its own noise. "
             "Slopes up to 60 degrees, 0.3 % of the points left out; a fit that is off by more than 0.1 mm counts as "
-            "no measurement. Goal: continuous within +-10 um at 0 to 2 mm/s, valid at 10 mm/s.",
+            f"no measurement. {FIBRE} Goal: continuous within +-10 um at 0 to 2 mm/s, valid at 10 mm/s.",
         ],
         tables,
         [f"{name}.png"],

@@ -11,7 +11,7 @@ import numpy as np
 from endo3d.services.evaluation import figures_of_merit as merit
 from endo3d.services.evaluation.cache import Cache, Result
 from endo3d.services.evaluation.calibrated import calibrated
-from endo3d.services.evaluation.measure import Clouds, Map, Merging, Points, Settings
+from endo3d.services.evaluation.measure import FIBRE, Clouds, Map, Merging, Points, Settings
 from endo3d.services.evaluation.report import Report, Table
 from endo3d.services.evaluation.virtual_run import VirtualRun, head_yaml
 from endo3d.services.views.figures import COLOURS, RAMPS, figure
@@ -240,7 +240,7 @@ def _report(
             f"`{SCENE}` scanned along its profile, motion `{MOTION}` (seeded: drift of about 3 mm/s, tremor of "
             f"50 to 100 um at 8 to 12 Hz), {RATE_HZ:g} Hz, `{PATTERNS}`, head {HEAD}, camera binned to 960x600, "
             f"merging distance {MERGING_UM:g} um, map points with {AT_LEAST} observations or more. "
-            f"{whole}{part}",
+            f"{FIBRE} {whole}{part}",
         ],
         tables,
         [f"{name}.png"],

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from endo3d.services.evaluation import figures_of_merit as merit
 from endo3d.services.evaluation.cache import Cache, Result
 from endo3d.services.evaluation.calibrated import calibrated
-from endo3d.services.evaluation.measure import Settings, clouds, points_of
+from endo3d.services.evaluation.measure import FIBRE, Settings, clouds, points_of
 from endo3d.services.evaluation.report import Report, Table
 from endo3d.services.evaluation.virtual_run import VirtualRun, head_yaml
 from endo3d.services.views.figures import COLOURS, figure
@@ -115,7 +115,7 @@ def _report(folder: Path, results: dict[str, dict[tuple[int, ...], Result]], qui
             f"{SPAN_MM[0]:g} x {SPAN_MM[1]:g} x {SPAN_MM[2]:g} mm (centres). Head {HEAD}, `{PATTERNS}`. "
             "Evaluated after VDI/VDE 2634 part 2 on slopes up to 60 degrees, 0.3 % of the points left out. "
             "Each is decoded with a calibration solved from 15 simulated board poses with 0.1 px of corner noise. "
-            "At the corners of the volume the round field shows only a part of the sphere.",
+            f"At the corners of the volume the round field shows only a part of the sphere. {FIBRE}",
         ],
         [
             Table("Spheres", ("figure", "paper", "ours", "goal"), rows),
