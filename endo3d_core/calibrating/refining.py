@@ -27,6 +27,8 @@ MARGIN = 2
 ITERATIONS = 3
 WINDOW = 0.5
 """Radius around a feature, of the pitch: neighbours share no sample, so their errors are independent."""
+SEEN_LEAST = 4
+"""Features that a homography takes."""
 SAMPLES_LEAST = 40
 STEP_PX = 0.5
 """For derivatives."""
@@ -108,6 +110,8 @@ def refine(
     drawing: Drawing | None = None
     for _ in range(ITERATIONS):
         seen = np.all(np.isfinite(pixels), axis=1)
+        if seen.sum() < SEEN_LEAST:
+            return np.full_like(pixels, np.nan)
         plane = PlaneMap(pixels[seen], board_mm[seen])
         expected = plane.find(board_mm, np.where(seen[:, None], pixels, pixels[seen].mean(axis=0)))
         mm_per_px = np.sqrt(np.abs(np.linalg.det(plane.jacobian(expected))))
@@ -132,8 +136,8 @@ def _shift(
     x, y = ((points - at) / radius).T
     A = np.stack((np.ones_like(x), x, y, print_, print_ * x, print_ * y, -du, -dv), axis=-1)
     solution = np.linalg.lstsq(A, samples.astype(np.float64), rcond=None)[0]
-    contrast = solution[3]
-    shift = solution[-2:] / contrast if contrast > 0 else np.full(2, np.nan)
+    contrast = solution[3]  # negative where the board was found turned by half a turn, black for white
+    shift = solution[-2:] / contrast if contrast else np.full(2, np.nan)
     return shift if np.hypot(*shift) < radius / 4 else np.full(2, np.nan)
 
 

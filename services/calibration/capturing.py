@@ -16,6 +16,7 @@ from endo3d.schemas.messages import (
     Level,
     LogLine,
     Message,
+    Mode,
     ProjectorCalibration,
 )
 from endo3d.services.calibration.writing import Calibration, frozen
@@ -85,7 +86,7 @@ class LiveCapture:
         self._epoch = -1
         self._calibration: dict[type, Message] = {}
         self._before = ""
-        for topic in (topics.CAMERA, topics.PROJECTOR):
+        for topic in (topics.CAMERA, topics.PROJECTOR, topics.MODE):
             bus.subscribe(topic, self._keep)
         bus.subscribe(topics.FRAME, self._frame)
 
@@ -154,9 +155,10 @@ class LiveCapture:
 
     def _frame(self, message: Message) -> None:
         assert isinstance(message, Frame)
-        self._before = self._before or message.pattern_set
         if message.epoch == self._epoch:
             self._frames.put(frozen(message))
 
     def _keep(self, message: Message) -> None:
+        if isinstance(message, Mode):
+            self._before = self._before or message.mode  # what was shown when we came
         self._calibration[type(message)] = message
