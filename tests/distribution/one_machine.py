@@ -21,7 +21,7 @@ from endo3d.services.runtime.bus import Bus
 from endo3d.services.runtime.certificates import make_authority, make_host
 from endo3d.services.runtime.stack_file import Stack
 
-LIMIT_S = 60.0
+LIMIT_S = 150.0
 SERVICES = """
 [scanner]
 module = "acting.scanner"
