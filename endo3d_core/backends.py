@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from endo3d_core import rigid
 from endo3d_core.live_view import LiveView
+from endo3d_core.loop_closure import LoopClosing
 from endo3d_core.merging import MergedMap
 from endo3d_core.odometry import Estimate, Odometry, State
 
@@ -26,6 +27,10 @@ class Tracker(Protocol):
 
     map: MergedMap
 
+    @property
+    def view(self) -> LiveView:
+        """The last cloud, made ready."""
+
     def track(self, channels: NDArray[np.float32], sequence: int, stamp_ns: int) -> Estimate:
         """One cloud (height, width, 6) float32: x y z mm, intensity, quality, sigma mm."""
 
@@ -33,11 +38,19 @@ class Tracker(Protocol):
         """Empty map; the next cloud's camera is the world."""
 
 
-def make(backend: Backend = "projective", merging_distance_mm: float = 0.075, capacity: int = 1_000_000) -> Tracker:
-    """A tracker by name. Raises ValueError for an unknown one."""
+def make(
+    backend: Backend = "projective",
+    merging_distance_mm: float = 0.075,
+    capacity: int = 1_000_000,
+    *,
+    loop_closure: bool = False,
+) -> Tracker:
+    """A tracker by name. Raises ValueError for an unknown one, and for loops that another than ours should close."""
+    if loop_closure and backend != "projective":
+        raise ValueError(f"the backend {backend!r} can't close loops; use 'projective'")
     match backend:
         case "projective":
-            return Odometry(merging_distance_mm, capacity)
+            return (LoopClosing if loop_closure else Odometry)(merging_distance_mm, capacity)
         case "kiss-icp":
             return PointTracker(KissIcp(), merging_distance_mm, capacity)
         case "small-gicp":

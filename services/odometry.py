@@ -7,16 +7,33 @@ prediction spans the true time between stamps. A replay takes every cloud.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
 from endo3d.schemas import topics
-from endo3d.schemas.messages import Cloud, MapDelta, Message, Pose, ProjectorCalibration, Tracking, Transform
+from endo3d.schemas.messages import (
+    Cloud,
+    Fit,
+    MapDelta,
+    Message,
+    PartPose,
+    Pose,
+    ProjectorCalibration,
+    Tracking,
+    Transform,
+)
+from endo3d.services.exchange.mesh import load_mesh
 from endo3d.services.runtime.service import Config, Refused, Service
 from endo3d.services.views.colouring import visible
-from endo3d_core import backends, merging, odometry, rigid
+from endo3d_core import backends, merging, odometry, rigid, trajectory
+from endo3d_core.loop_closure import LoopClosing
+from endo3d_core.odometry import Estimate, State
+from endo3d_core.part_registration import Part, PartRegistration, visible_points
+from endo3d_core.registration import visible_surface
 
 SHOWN_RELIEF_MM = 3.0
 """Heights that the colours of the published map tell apart, around the first points' median."""
@@ -29,6 +46,14 @@ class OdometryConfig(Config):
     """Points nearer than this become one (section 3.3); it limits the lateral resolution."""
     map_limit: int = Field(1_000_000, ge=10_000)
     """Map points that are kept at most; each takes about 120 bytes."""
+    loop_closure: bool = False
+    """Recognise places seen before and put path and map right (costs about one more merge per cloud)."""
+    model: str = ""
+    """STL or PLY file of the part, in mm: ``part_pose`` then says where the tip is in its coordinates."""
+    model_pose: tuple[float, float, float, float, float, float] | None = None
+    """Of the first camera in the part: x y z mm, rotation vector deg. Without it the part is searched for."""
+    model_every: int = Field(8, ge=1)
+    """Clouds from one look at the model to the next."""
     map_hz: float = Field(30.0, gt=0.0, le=topics.MAP.rate_hz)
     """How often changes of the map are published, at most."""
 
@@ -40,8 +65,8 @@ class Odometry(Service[OdometryConfig]):
     reads = (topics.CLOUD, topics.PROJECTOR)
     optional = (topics.PROJECTOR,)
     newest = (topics.CLOUD,)
-    writes = (topics.POSE, topics.TRANSFORM, topics.MAP)
-    commands = ("reset", "snapshot")
+    writes = (topics.POSE, topics.TRANSFORM, topics.MAP, topics.PART_POSE)
+    commands = ("reset", "snapshot", "trajectory")
     nice = 5
     """It may skip clouds; decoder and recorder may not skip frames."""
 
@@ -49,11 +74,15 @@ class Odometry(Service[OdometryConfig]):
         super().__init__(config)
         self.odometry = self._fresh()
         self._revision = 0
+        self._shown: merging.MergedMap | None = None
+        self._part: PartRegistration | None = None
+        self._looks = 0
         self._relief_mm: tuple[float, float] | None = None
         self._next_map_ns = 0
         self._sequence: int | None = None
         self._stride = 0
         self._skipped = 0
+        self._submap = 0
         self._states: dict[str, int] = dict.fromkeys(Tracking, 0)
 
     def warm(self) -> None:
@@ -74,21 +103,30 @@ class Odometry(Service[OdometryConfig]):
                 yield Transform(message.stamp_ns, "camera", message.frame_id, rigid.inverse(message.T_projector_camera))
 
     def command(self, verb: str, parameters: Mapping[str, Any], now_ns: int) -> Iterator[Message | Mapping[str, Any]]:
-        """``reset`` empties the map, the next cloud is the world; ``snapshot`` publishes the whole map."""
+        """``reset`` empties the map, the next cloud is the world; ``snapshot`` publishes the whole map.
+
+        ``trajectory`` replies the corrected path as TUM and CSV text (with ``loop_closure``).
+        """
         match verb:
             case "reset":
                 self.odometry.reset()
+                if self._part is not None:
+                    self._part.reset()
             case "snapshot":
-                self.odometry.map.take_delta()
+                pass
+            case "trajectory":
+                yield self._trajectory()
+                return
             case _:
                 raise Refused(f"no command {verb!r}; odometry knows: {', '.join(self.commands)}")
-        delta = merging.Delta(self.odometry.map.points(), np.empty((0, 3), np.int16))
-        yield self._map_delta(delta, now_ns, reset=True)
-        yield {"points": len(delta.points), "revision": self._revision}
+        whole = self._whole_map(now_ns)
+        yield whole
+        yield {"points": len(whole.points), "revision": self._revision}
 
     def values(self) -> Mapping[str, float]:
-        """Map points, clouds that newer ones overtook (or that were never decoded), and clouds in each state."""
-        return {"map_points": self.odometry.map.count, "clouds_skipped": self._skipped, **self._states}
+        """Map points, loops, clouds that newer ones overtook (or were not decoded), and clouds in each state."""
+        loops = {"loops": self.odometry.loops} if isinstance(self.odometry, LoopClosing) else {}
+        return {"map_points": self.odometry.map.count, "clouds_skipped": self._skipped, **loops, **self._states}
 
     def trouble(self) -> str:
         share = self.odometry.map.count / self.config.map_limit
@@ -96,13 +134,70 @@ class Odometry(Service[OdometryConfig]):
             return ""
         return f"the map is {share:.0%} full; it will forget what it saw longest ago: raise map_limit or reset it"
 
+    def open(self) -> None:
+        """Raises ``UserError`` when the model can't be read: better now than at the first cloud."""
+        if self.config.model:
+            load_mesh(self.config.model)
+
     def _fresh(self) -> backends.Tracker:
-        return backends.make(self.config.backend, 1e-3 * self.config.merging_distance_um, self.config.map_limit)
+        return backends.make(
+            self.config.backend,
+            1e-3 * self.config.merging_distance_um,
+            self.config.map_limit,
+            loop_closure=self.config.loop_closure,
+        )
+
+    def _trajectory(self) -> Mapping[str, Any]:
+        if not isinstance(self.odometry, LoopClosing):
+            raise Refused("there is no corrected path without loop_closure = true; the log has the poses")
+        path = self.odometry.trajectory()
+        known = path[path["state"] != Tracking.LOST]
+        csv = trajectory.to_csv(
+            path["stamp_ns"].tolist(), path["T"], path["information"], 1e3 * path["sigma_weak_mm"], path["state"]
+        )
+        tum = trajectory.to_tum(known["stamp_ns"].tolist(), known["T"])
+        return {"poses": len(path), "loops": self.odometry.loops, "tum": tum, "csv": csv}
+
+    def _on_part(self, cloud: Cloud, estimate: Estimate) -> Iterator[Message]:
+        """Where the tip is in the part's coordinates: by a look at the model now and then, by odometry in between."""
+        if estimate.state is State.LOST or not self.config.model:
+            return
+        frame = visible_surface(self.odometry.view.live)
+        if self._part is None:
+            self._part = PartRegistration(Part(*load_mesh(self.config.model)), frame.radius_mm, self._given_pose())
+        if self._looks % self.config.model_every == 0:
+            self._part.look(*visible_points(self.odometry.map), estimate.T_world_camera, frame)
+        self._looks += 1
+        found = self._part.estimate
+        yield PartPose(
+            stamp_ns=cloud.stamp_ns,
+            sequence=cloud.sequence,
+            T_part_camera=rigid.orthonormal(found.T_part_world @ estimate.T_world_camera),
+            information=found.information,
+            state=Fit(found.state),
+            tracking=Tracking(estimate.state),
+            sigma_weak_um=1e3 * found.sigma_weak_mm,
+            weak_direction=found.weak_direction,
+            inlier_share=found.inlier_share,
+            residual_um=1e3 * found.residual_mm,
+            model=Path(self.config.model).name,
+        )
+
+    def _given_pose(self) -> NDArray[np.float64] | None:
+        if self.config.model_pose is None:
+            return None
+        x, y, z, *turn_deg = self.config.model_pose
+        T = rigid.translation((x, y, z))
+        T[:3, :3] = rigid.rotation_exp(np.radians(turn_deg))
+        return T
 
     def _track(self, cloud: Cloud) -> Iterator[Message]:
         self._count_skipped(cloud.sequence)
         estimate = self.odometry.track(cloud.channels, cloud.sequence, cloud.stamp_ns)
         self._states[estimate.state] += 1
+        if estimate.submap != self._submap:  # another world, or back in an older one
+            self._submap = estimate.submap
+            yield self._whole_map(cloud.stamp_ns)
         yield Pose(
             stamp_ns=cloud.stamp_ns,
             sequence=cloud.sequence,
@@ -118,9 +213,12 @@ class Odometry(Service[OdometryConfig]):
             newest_stamp_ns=cloud.newest_stamp_ns,
         )
         yield Transform(cloud.stamp_ns, "world", cloud.frame_id, estimate.T_world_camera)
+        yield from self._on_part(cloud, estimate)
         if cloud.stamp_ns >= self._next_map_ns:
             self._next_map_ns = cloud.stamp_ns + round(1e9 / self.config.map_hz)
-            yield self._map_delta(self.odometry.map.take_delta(), cloud.stamp_ns, reset=self._revision == 0)
+            # After a correction it is another map, which fills while it is being rebuilt.
+            fresh, self._shown = self.odometry.map is not self._shown, self.odometry.map
+            yield self._map_delta(self.odometry.map.take_delta(), cloud.stamp_ns, reset=fresh)
 
     def _count_skipped(self, sequence: int) -> None:
         """By gaps in the sequence, in the shortest step between clouds: not every mode has a cloud for every frame."""
@@ -129,6 +227,11 @@ class Odometry(Service[OdometryConfig]):
         if step > 0:
             self._stride = min(self._stride or step, step)
             self._skipped += step // self._stride - 1
+
+    def _whole_map(self, stamp_ns: int) -> MapDelta:
+        self.odometry.map.take_delta()
+        delta = merging.Delta(self.odometry.map.points(), np.empty((0, 3), np.int16))
+        return self._map_delta(delta, stamp_ns, reset=True)
 
     def _map_delta(self, delta: merging.Delta, stamp_ns: int, *, reset: bool) -> MapDelta:
         self._revision += 1
