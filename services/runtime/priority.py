@@ -3,11 +3,14 @@
 Ordinary users may do all of this: nothing is raised above other programs. A thread's priority is that of the thread
 that started it, so whoever yields keeps one thread from before, to start what must not yield: the threads of zenoh,
 which are given little to do, but hold the writers' memory until they have done it.
+
+Most systems share the processor out among sessions first, whatever their priority (sched_autogroup), and every service
+of a stack has its own session: then these priorities order the threads of one service, and no service can take from
+another what that needs below its equal share.
 """
 
 from __future__ import annotations
 
-import contextlib
 import ctypes
 import os
 import platform
@@ -15,7 +18,6 @@ import struct
 import sys
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 from typing import Final, TypeVar
 
 T = TypeVar("T")
@@ -47,10 +49,6 @@ def settle(nice: int) -> None:
         return
     if nice > 0:
         os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
-        if os.getsid(0) == os.getpid():
-            # On most systems the processor is shared out among sessions first, and the launcher gave us one.
-            with contextlib.suppress(OSError):  # not on this one
-                Path("/proc/self/autogroup").write_text(str(nice))
     elif (number := _SCHED_SETATTR.get(platform.machine())) is not None:
         attributes = _ATTRIBUTES.pack(_ATTRIBUTES.size, os.SCHED_OTHER, 0, nice, 0, _SLICE_NS, 0, 0)
         ctypes.CDLL(None).syscall(number, 0, attributes, 0)  # a kernel before 6.12 goes on as it was
