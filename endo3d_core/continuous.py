@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from endo3d_core import windowed_fit
+from endo3d_core import aligned, windowed_fit
 from endo3d_core.binning import Grid
 from endo3d_core.compiled import kernel
 from endo3d_core.samples import PHASOR_UNIT, SAMPLE_UNIT, average_row
@@ -101,7 +101,7 @@ def scratch(width: int, step: int, fit: bool) -> Scratch:
     worked = width if fit else coarse
 
     def rows(*shape: int) -> NDArray[np.float32]:
-        return np.zeros(shape, np.float32)
+        return aligned.zeros(shape)
 
     return Scratch(
         coarse=rows(4, coarse),
@@ -137,7 +137,7 @@ def decode_fitted(window: Window, places: Places, model: Model, work: Scratch, o
     for v in range(height + 2):
         if v < height:
             interpolate_row(model.centre, v / model.rows_per_node, 0, work.carrier)
-            _scale(carrier, np.float32(model.rad_per_px), carrier)
+            _scale(carrier, np.float32(model.rad_per_px))
             average_row(carrier, model.step, coarse_carrier)
             _unwrap(window.phasors, places, v, coarse_carrier, model, start, modulation, residual)
             upsample(start, model.step, HALF_ORDER_RAD, smooth)
@@ -187,10 +187,13 @@ def decode_bandpass(window: Window, places: Places, model: Model, work: Scratch,
     for v in range(height + 1):
         if v < height:
             interpolate_row(model.centre, v / model.rows_per_node, 0, work.carrier)
-            _scale(carrier, np.float32(model.rad_per_px), carrier)
+            _scale(carrier, np.float32(model.rad_per_px))
             _unwrap(window.phasors, places, v, carrier, model, work.phases[v % 3], modulation, residual)
-            _mean_grey(window.grids, places, v, model, work.grey[v % 3])
-            _grade(modulation, residual, work.grey[v % 3], slope, offset, work.qualities[v % 2], work.variances[v % 2])
+            if out.points.size > 0:
+                _mean_grey(window.grids, places, v, model, work.grey[v % 3])
+                _grade(
+                    modulation, residual, work.grey[v % 3], slope, offset, work.qualities[v % 2], work.variances[v % 2]
+                )
         else:
             work.phases[v % 3][:] = nan
         o = v - 1  # the row whose neighbours are known
@@ -228,9 +231,9 @@ def _unwrap(
 
 
 @kernel
-def _scale(row: NDArray[np.float32], factor: np.float32, out: NDArray[np.float32]) -> None:
+def _scale(row: NDArray[np.float32], factor: np.float32) -> None:
     for x in range(row.size):
-        out[x] = factor * row[x]
+        row[x] *= factor
 
 
 @kernel

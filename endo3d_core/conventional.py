@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from endo3d_core import heterodyne, triangulation
+from endo3d_core import aligned, heterodyne, triangulation
 from endo3d_core.binning import Image, bin_image, grid_of
 from endo3d_core.compiled import kernel
 from endo3d_core.demodulation import Groups, demodulation, groups, phase_variances, phase_weights, unwrapping_chain
@@ -20,6 +20,7 @@ from endo3d_core.hdr import fuse_row
 from endo3d_core.heterodyne import Chain
 from endo3d_core.interleaved import SATURATION, Front
 from endo3d_core.patterns import PatternSet
+from endo3d_core.phase import reciprocal, root
 from endo3d_core.triangulation import INTENSITY, QUALITY, SIGMA, Lookup, Output, Z
 from endo3d_core.uncertainty import IMX174, Sensor
 
@@ -147,9 +148,9 @@ def _grade(
     shortest, one, zero, tiny = model.exposures[0], np.float32(1.0), np.float32(0.0), np.float32(1e-6)
     for x in range(a.size):
         mean, power = grey * a[x], max(grey * grey * (c[x] * c[x] + s[x] * s[x]), tiny)
-        variance[x] = (slope * mean + offset) / power
-        intensity[x] = mean * shortest / max(exposed[x], shortest)
-        quality[x] = min(np.sqrt(power) / max(mean, tiny), one) * max(one - residual[x], zero)
+        variance[x] = (slope * mean + offset) * reciprocal(power)
+        intensity[x] = mean * shortest * reciprocal(max(exposed[x], shortest))
+        quality[x] = min(root(power) * reciprocal(max(mean, tiny)), one) * max(one - residual[x], zero)
 
 
 @kernel
@@ -179,7 +180,8 @@ def _decode(
             heterodyne.unwrap_row(work.wrapped, chain, phase, residual)
             heterodyne.average_phases(work.wrapped, chain, phase, mean)
             _trust(work.components, residual, contrast_min, dark, mean)
-            _grade(work.components, residual, work.exposed, model, variance, values[INTENSITY], values[QUALITY])
+            if out.points.size > 0:
+                _grade(work.components, residual, work.exposed, model, variance, values[INTENSITY], values[QUALITY])
             triangulation.triangulate_row(
                 work.lookup[1:5], px_per_rad, z_min, z_max, mean, variance, values[Z], values[SIGMA]
             )
@@ -240,17 +242,17 @@ class Conventional:
         lookup = self.lookup
         kind, self._grey = (np.dtype(np.float32), 1.0) if self.front else _kept(dtype, self.bin_px)
         shape = (lookup.height, lookup.width)
-        self._frames = np.zeros((self.frames, *shape), kind)
+        self._frames = aligned.zeros((self.frames, *shape), kind)
         self._transposed = np.zeros(shape[::-1], kind)
         columns = max(n for n in range(1, min(STRIP, lookup.width) + 1) if lookup.width % n == 0)
         wide = np.uint16 if kind.itemsize == 1 or (kind == np.uint16 and exposures == 1) else np.float32
 
         def rows(*shape: int) -> NDArray[np.float32]:
-            return np.zeros(shape, np.float32)
+            return aligned.zeros(shape)
 
         self._scratch = Scratch(
-            brightest=np.zeros(columns, kind),
-            fused=np.zeros((patterns, columns), wide),
+            brightest=aligned.zeros(columns, kind),
+            fused=aligned.zeros((patterns, columns), wide),
             exposed=rows(columns),
             components=rows(1 + 2 * len(self.frequencies), columns),
             spare=rows(columns),

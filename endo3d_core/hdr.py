@@ -32,23 +32,32 @@ def fuse_row(
     ``exposed`` (columns,) is the summed exposure, 0 where every exposure saturates (``fused`` is 0 there too).
     ``saturation`` and the scratch ``brightest`` (columns,) have the frames' dtype; ``fused`` holds their sum.
     """
-    patterns, columns, zero = fused.shape[0], exposed.size, np.float32(0.0)
+    patterns, columns = fused.shape[0], exposed.size
     for e in range(exposures.size):
-        first, weight, kept = e * patterns, exposures[e], np.float32(0.0 if e == 0 else 1.0)
-        _maximum(frames[first, v, left : left + columns], frames[first + 1, v, left : left + columns], brightest)
-        for p in range(2, patterns):
-            _maximum(brightest, frames[first + p, v, left : left + columns], brightest)
-        for x in range(columns):
-            exposed[x] = kept * exposed[x] + (weight if brightest[x] < saturation else zero)
+        first = e * patterns
+        brightest[:] = 0
+        for p in range(patterns):
+            _raise_to(frames[first + p, v, left : left + columns], brightest)
+        _add_exposure(brightest, saturation, exposures[e], e == 0, exposed)
         for p in range(patterns):
             _add_unsaturated(frames[first + p, v, left : left + columns], brightest, saturation, e == 0, fused[p])
 
 
 @kernel
-def _maximum(a: NDArray[Any], b: NDArray[Any], out: NDArray[Any]) -> None:
+def _raise_to(row: NDArray[Any], out: NDArray[Any]) -> None:
     for x in range(out.size):
-        p, q = a[x], b[x]
+        p, q = row[x], out[x]
         out[x] = p if p > q else q
+
+
+@kernel
+def _add_exposure(
+    brightest: NDArray[Any], saturation: Any, exposure: np.float32, first: bool, out: NDArray[np.float32]
+) -> None:
+    zero, kept = np.float32(0.0), np.float32(0.0 if first else 1.0)
+    for x in range(out.size):
+        before = out[x]
+        out[x] = kept * before + (exposure if brightest[x] < saturation else zero)
 
 
 @kernel

@@ -19,7 +19,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from endo3d_core import bandpass, continuous, samples, triangulation, uncertainty, unwrap
+from endo3d_core import aligned, bandpass, continuous, samples, triangulation, uncertainty, unwrap
 from endo3d_core.binning import Grid, Image, bin_image, grid_of
 from endo3d_core.patterns import PatternSet
 from endo3d_core.samples import Normalisation
@@ -104,17 +104,17 @@ class Interleaved:
         height, width = self.lookup.height, self.lookup.width
         kind, unit = grid_of(dtype, self.bin_px * self._grid_step, self.bin_px)
         kind, self._unit = (np.float32, 1.0) if self.front else (kind, unit)
-        grids = np.zeros((GRIDS, height, width // self._grid_step), kind)
+        grids = aligned.zeros((GRIDS, height, width // self._grid_step), kind)
         self._window = continuous.Window(
-            np.zeros((3, height, 2, width // step), np.int16),
-            np.zeros((3, height, width) if self.fit else (3, 0, 0), np.int16),
+            aligned.zeros((3, height, 2, width // step), np.int16),
+            aligned.zeros((3, height, width) if self.fit else (3, 0, 0), np.int16),
             grids,
         )
-        self._transposed = np.zeros(grids.shape[:0:-1], kind)
+        self._transposed: Grid = np.zeros((width // self._grid_step, height), kind)
         # Only the rows that the slot check looks at are ever filled, or even mapped.
         self._probes = np.zeros((3, height, width // step), np.float32)
         self._padded = [np.zeros(width // step + 2 * gabor.taps, np.float32) for gabor in self.filters]
-        self._rows = np.zeros((3, grids.shape[2]), np.float32)
+        self._rows = aligned.zeros((3, grids.shape[2]))
         self._scratch = continuous.scratch(width, step, self.fit)
 
     def _build_model(

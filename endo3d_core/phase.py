@@ -23,6 +23,33 @@ _A7 = np.float32(-0.0851330)
 _A9 = np.float32(0.0208351)
 
 
+_RECIPROCAL, _ROOT = np.int32(0x7EF311C7), np.int32(0x5F3759DF)
+_THREE_HALVES = np.float32(1.5)
+
+
+@kernel
+def reciprocal(x: np.float32) -> np.float32:
+    """1 / x of a normal x > 0 to 2e-7: half the time of a division, which a wide vector unit can't pipeline.
+
+    The exponent's bits negate themselves; two steps of Halley's method turn their 12 % into 0.2 % and rounding.
+    """
+    y = np.int32(_RECIPROCAL - np.float32(x).view(np.int32)).view(np.float32)
+    e = ONE - x * y
+    y += y * (e + e * e)
+    e = ONE - x * y
+    return y + y * (e + e * e)
+
+
+@kernel
+def root(x: np.float32) -> np.float32:
+    """Square root of x >= 0 to 5e-6, from the inverse root of the same kind and two steps of Newton's method."""
+    y = np.int32(_ROOT - (np.float32(max(x, TINY)).view(np.int32) >> np.int32(1))).view(np.float32)
+    half = HALF * x
+    y = y * (_THREE_HALVES - half * y * y)
+    y = y * (_THREE_HALVES - half * y * y)
+    return x * y
+
+
 @kernel
 def atan(t: np.float32) -> np.float32:
     """Of -1 <= t <= 1, to 1.2e-5 rad."""
@@ -35,7 +62,7 @@ def angle(y: np.float32, x: np.float32) -> np.float32:
     """atan2(y, x) to 1.2e-5 rad; 0 at the origin, NaN stays NaN."""
     ax, ay = abs(x), abs(y)
     swap = ay > ax
-    t = (ax if swap else ay) / ((ay if swap else ax) + TINY)
+    t = (ax if swap else ay) * reciprocal((ay if swap else ax) + TINY)
     a = atan(t)
     a = HALF_PI - a if swap else a
     a = PI - a if x < ZERO else a

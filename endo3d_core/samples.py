@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from endo3d_core.bandpass import filter_row
 from endo3d_core.binning import Grid
 from endo3d_core.compiled import kernel
+from endo3d_core.phase import reciprocal
 
 SAMPLE_UNIT = 1.0 / 32768.0
 """Samples lie within +-1. They are odd multiples of it: 0 stands for none."""
@@ -75,7 +76,7 @@ def normalise(
         p, m, b, c, a = plus[v], minus[v], before[v], centre[v], after[v]
         for x in range(row.size):
             total = np.float32(b[x]) + middle * np.float32(c[x]) + np.float32(a[x])
-            value = gain * (np.float32(p[x]) - share * np.float32(m[x])) / total - offset
+            value = gain * (np.float32(p[x]) - share * np.float32(m[x])) * reciprocal(total) - offset
             row[x] = value if (total > least) & (total < most) else zero
         if samples.size > 0:
             _keep_samples(row, samples[v])

@@ -19,6 +19,7 @@ from endo3d_core.calibration import Rig
 from endo3d_core.compiled import kernel
 from endo3d_core.packing import pack_points, pack_xyz
 from endo3d_core.patterns import Axis
+from endo3d_core.phase import reciprocal, root
 
 ROW_STEP_PX = 16
 NODES = 6
@@ -148,16 +149,16 @@ def triangulate_row(
     ``cubic`` (4, width) holds C0..C3 of the row. NaN phases and depths outside z_min..z_max become NaN.
     """
     c0, c1, c2, c3 = cubic[0], cubic[1], cubic[2], cubic[3]
-    two, three, one, nan = np.float32(2.0), np.float32(3.0), np.float32(1.0), np.float32(np.nan)
+    two, three, nan = np.float32(2.0), np.float32(3.0), np.float32(np.nan)
     for x in range(phase.size):
         d = phase[x] * px_per_rad
-        depth = one / (c0[x] + d * (c1[x] + d * (c2[x] + d * c3[x])))
+        depth = reciprocal(c0[x] + d * (c1[x] + d * (c2[x] + d * c3[x])))
         slope = depth * depth * (c1[x] + d * (two * c2[x] + d * three * c3[x])) * px_per_rad
         inside = (depth >= z_min) & (depth <= z_max)
         kept = depth if inside else nan
         z[x] = kept
-        # A NaN depth makes its sigma NaN; a choice would put the root into a branch and end vectorisation.
-        sigma[x] = np.sqrt(slope * slope * variance[x]) + (kept - kept)
+        # A NaN depth makes its sigma NaN.
+        sigma[x] = abs(slope) * root(variance[x]) + (kept - kept)
 
 
 class Output(NamedTuple):

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from endo3d_core.compiled import kernel
-from endo3d_core.phase import HALF, PER_TURN, TWO_PI, angle, wrap
+from endo3d_core.phase import HALF, PER_TURN, TWO_PI, angle, root, wrap
 
 MODULATION_MIN = 0.125
 """A quarter of the 1/2 that an ideal normalised fringe has."""
@@ -59,7 +59,7 @@ def unwrap_row(
         trusted = (abs(coarse - e) < most) & (power > least)
         phase[x] = e if trusted else nan
         residual[x] = abs(coarse - e)
-        modulation[x] = half_unit * np.sqrt(power)
+        modulation[x] = half_unit * root(power)
 
 
 @kernel

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from endo3d_core.compiled import kernel
-from endo3d_core.phase import atan, cos_sin
+from endo3d_core.phase import atan, cos_sin, reciprocal
 
 HALF_COLUMNS, HALF_ROWS = 2, 1
 """The window is 5 columns by 3 rows."""
@@ -141,7 +141,7 @@ def solve(
         g2 = g * g
         expected = (slope * g + offset) * det
         noise = max(expected, share * g2 * (total * det - b * r0 - a * q0))
-        inverse = one / (noise * g2 * power * a)
+        inverse = reciprocal(noise * g2 * power * a)
         t = b * inverse * noise * g2 * power
         good = (power > least * det * det) & (abs(t) < one) & (a > np.float32(0.0))
         d = atan(t)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import tracemalloc
+
 import numpy as np
 import pytest
 from planes import Plane, field, head_rig, render, small_rig
@@ -93,13 +95,55 @@ def test_any_start_slot_gives_the_same_plane() -> None:
     np.testing.assert_allclose(depths[1:], [depths[0]] * 3, atol=0.012)
 
 
-def test_full_resolution_camera() -> None:
+@pytest.fixture(scope="module")
+def full_size() -> list[np.ndarray]:
+    return [render(head_rig(), pattern, Plane()) for pattern in SET.patterns]
+
+
+@pytest.mark.parametrize(("bin_px", "fit"), [(4, True), (1, False)])
+def test_full_resolution_camera(full_size: list[np.ndarray], bin_px: int, fit: bool) -> None:
+    """Points, xyz and 16-bit depth tell the same; without the fit every camera pixel gets a depth."""
     rig = head_rig()
-    decoder = Interleaved(SET, triangulation.build(rig, 4, 16.5, 23.5), 4)
+    lookup = triangulation.build(rig, bin_px, 16.5, 23.5)
+    decoder = Interleaved(SET, lookup, bin_px, fit=fit)
     for k in range(7):
-        decoder.push(render(rig, SET[k], Plane()), k % 4)
-    points = np.empty((300, 480, 6), np.float32)
-    decoder.points(points)
-    truth = Plane().depth(rig.camera.ray(triangulation.grid_pixels(rig, 4, "columns")))
-    error = (points[..., 2] - truth)[field(rig, 4)]
+        decoder.push(full_size[k % 4], k % 4)
+    shape = (lookup.height, lookup.width)
+    points, xyz = np.empty((*shape, 6), np.float32), np.empty((*shape, 3), np.float32)
+    depth = np.empty(shape, np.uint16)
+    valid = decoder.decode(triangulation.output(points, xyz, depth, scale_mm=1.1e-4, offset_mm=16.49))
+    truth = Plane().depth(rig.camera.ray(triangulation.grid_pixels(rig, bin_px, "columns")))
+    error = (points[..., 2] - truth)[field(rig, bin_px)]
+    assert np.isfinite(error).mean() > 0.97
     assert np.sqrt(np.nanmean(error**2)) < 3e-3
+    assert valid == np.isfinite(xyz[..., 2]).sum()
+    assert np.array_equal(xyz, points[..., :3], equal_nan=True)
+    z = np.where(depth > 0, 16.49 + 1.1e-4 * depth, np.nan)
+    np.testing.assert_allclose(z, points[..., 2], atol=0.6e-4)
+
+
+def test_a_step_takes_no_memory() -> None:
+    """Frame after frame: what a step takes it gives back, and no plane of the grid is among it."""
+    rig = small_rig(4)
+    decoder = Interleaved(patterns.parse("interleaved f1=12"), triangulation.build(rig, 2, 16.5, 23.5), 2)
+    rng, out = np.random.default_rng(5), np.empty((150, 240, 6), np.float32)
+    images = rng.integers(90, 110, (4, 300, 480), np.uint8)
+
+    def steps(first: int, count: int) -> None:
+        for k in range(first, first + count):
+            if decoder.push(images[k % 4], k % 4):
+                decoder.points(out)
+
+    steps(0, 40)
+    tracemalloc.start()
+    try:
+        steps(40, 20)
+        tracemalloc.reset_peak()
+        before, _ = tracemalloc.get_traced_memory()
+        steps(60, 20)
+        after, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    plane_bytes = 150 * 240
+    assert peak - before < plane_bytes
+    assert after - before < plane_bytes

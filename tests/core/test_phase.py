@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from endo3d_core.phase import angle, cos_sin, wrap
+from endo3d_core.phase import angle, cos_sin, reciprocal, root, wrap
 
 single = st.floats(-1e4, 1e4, width=32)
 
@@ -37,3 +37,16 @@ def test_cos_sin_is_cos_and_sin(phase: float) -> None:
     c, s = cos_sin(np.float32(phase))
     assert abs(c - np.cos(phase)) < 5e-5
     assert abs(s - np.sin(phase)) < 5e-5
+
+
+@given(x=st.floats(2.0**-99, 2.0**99, width=32))
+def test_reciprocal_and_root_without_a_division(x: float) -> None:
+    assert abs(reciprocal(np.float32(x)) * x - 1.0) < 3e-7
+    assert abs(reciprocal(np.float32(-x)) * x + 1.0) < 3e-7
+    assert abs(root(np.float32(x)) / np.sqrt(x) - 1.0) < 6e-6
+
+
+def test_the_root_of_nothing_is_nothing() -> None:
+    assert root(np.float32(0.0)) == 0.0
+    assert np.isnan(root(np.float32(np.nan)))
+    assert np.isnan(reciprocal(np.float32(np.nan)))
