@@ -16,6 +16,7 @@ def figures(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     return decode.evaluate(Settings(tmp_path_factory.mktemp("decode"), quick=True)).figures
 
 
+@pytest.mark.slow
 def test_a_sphere_of_1_mm_keeps_its_size_and_form(figures: dict[str, Any]) -> None:
     """Four fringes across: the band-pass alone is off by 10 um here, a Fourier transform of the row by 134."""
     found = figures["sphere R 1 mm, still, reuse + fit"]
@@ -24,16 +25,19 @@ def test_a_sphere_of_1_mm_keeps_its_size_and_form(figures: dict[str, Any]) -> No
     assert abs(figures["sphere R 1 mm, still, reuse"]["radius_um"]) > 5.0
 
 
+@pytest.mark.slow
 def test_planes_and_prints_are_flat(figures: dict[str, Any]) -> None:
     assert figures["plane, still, reuse + fit"]["rms_um"] <= 1.5
     assert figures["texture, still, reuse + fit"]["rms_um"] <= 3.0
 
 
+@pytest.mark.slow
 def test_fringe_orders_are_right(figures: dict[str, Any]) -> None:
     assert figures["plane, axial 40 um/frame, reuse + fit"]["wrong"] == 0.0
     assert figures["steps, still, reuse + fit"]["wrong"] < 0.1
 
 
+@pytest.mark.slow
 def test_a_step_is_sharp(figures: dict[str, Any]) -> None:
     assert figures["step of 0.5 mm, still, reuse + fit"]["step_px"] <= 4.0
 
