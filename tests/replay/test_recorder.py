@@ -87,6 +87,17 @@ def test_rates(tmp_path: Path) -> None:
     assert log.count(topics.TRUTH) == 100
 
 
+def test_what_is_thinned_out_is_read_at_the_archives_rate(tmp_path: Path) -> None:
+    service = recorder(tmp_path, log_hz={"frame": 30, "truth": 0})
+    paces = {topic.name: service.newest_hz(topic) for topic in service.reads}
+    service.close()
+    assert paces.pop("frame") == 30
+    assert paces.pop("truth") == 0
+    assert paces.pop("cloud") == topics.CLOUD.log_hz
+    assert paces.pop("depth") == topics.DEPTH.log_hz
+    assert set(paces.values()) == {None}
+
+
 @given(jitter=st.lists(st.integers(-3_000_000, 3_000_000), min_size=200, max_size=200))
 def test_a_rate_holds_whatever_the_jitter(tmp_path: Path, jitter: list[int]) -> None:
     """30 Hz of a 100 Hz stream for 2 s, evenly."""

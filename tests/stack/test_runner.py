@@ -182,6 +182,25 @@ def test_newest_only_reads_skip_without_a_loss(outside: Bus, rig: str) -> None:
         assert bus.tally.dropped == {}
 
 
+def test_what_is_looked_at_now_and_then_costs_no_more_and_the_last_is_seen(outside: Bus, rig: str) -> None:
+    class Looker(Halver):
+        def newest_hz(self, topic: topics.Topic) -> float | None:
+            return 5.0
+
+    depths = watch(outside, topics.DEPTH)
+    with Bus.open(rig, name="looker") as bus:
+        run = Running(Looker(Config()), bus)
+        wait_for(outside, "looker")
+        began_s = time.monotonic()
+        for sequence in range(100):
+            outside.publish(frame(outside, sequence, (24, 32)))
+            time.sleep(0.005)
+        depths.wait(lambda depth: depth.sequence == 99)
+        run.stop()
+        assert len(depths.messages) <= 2 + 5 * (time.monotonic() - began_s)
+        assert bus.tally.dropped == {}
+
+
 def test_a_source_that_ends_ends_its_process_with_zero(rig: str) -> None:
     ticker = Ticker(Config())
     ticker.limit = 5
