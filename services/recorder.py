@@ -45,7 +45,7 @@ class RecorderConfig(Config):
     """A new file after so many MB; 0 is never."""
     split_s: float = Field(default=0.0, ge=0)
     """A new file after so many seconds; 0 is never."""
-    queue_mb: int = Field(default=256, ge=16)
+    queue_mb: int = Field(default=512, ge=16)
     """What may wait for the disk; beyond it messages are dropped and counted."""
     floor_mb: int = Field(default=512, ge=0)
     """Recording stops, whole, when the disk has less than this left."""
