@@ -223,7 +223,7 @@ class Odometry:
             if steps > 1 and moved_mm < _CONVERGED * sigma_mm:
                 break
         if surprised_mm > view.pitch_mm or self._is_stale(stamp_ns) or (self._is_young and solution.held.size):
-            holds = convincing(n, view.texture_noise)
+            holds = convincing(n, view.texture_noise, young=self._is_young)
         else:
             holds = believable(n)
         if not holds or moved_mm > _STRAYED * scale_mm:

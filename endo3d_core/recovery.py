@@ -46,9 +46,10 @@ NUDGE_CELLS = 5.0
 """How far a better start is looked for to each side."""
 CLEARLY = 0.15
 """By so much in score (share in place times one plus correlation): several times what noise makes without texture."""
-WORST_RESIDUAL = 2.8
-"""Of the differences in texture, in the cloud's own noise: 0.2 to 2.3 in place, simulated or decoded, with texture or
-without; 3.4 to 9 when a fifth of a millimetre off (texture of 5 % and more)."""
+WORST_MISFIT, WORST_MISFIT_YOUNG = 4.0, 2.8
+"""Of the differences in texture, in the cloud's own noise. To a young map 0.2 to 2.3 in place, simulated or decoded,
+with texture or without, and 3.4 to 9 when a fifth of a millimetre off; to an old one, which has more detail, up to 3.8
+in place."""
 
 
 class World(Points, Protocol):
@@ -70,6 +71,7 @@ class Search:
         self._shifts = shifts(frame, view)
         self._levelling = np.eye(4)
         self._next = 0
+        self._young = young
         self.rows = nearby(world, T_last, frame, 1 if young else CONFIRMED)
 
     def look(self, view: LiveView, starts: Iterable[Array], linearisation: Linearisation) -> Array | None:
@@ -79,7 +81,7 @@ class Search:
         frame = visible_surface(view.live)
         for start in starts:
             refined = self._refine(start, view, frame, linearisation)
-            if refined is not None and convincing(refined[1], view.texture_noise):
+            if refined is not None and convincing(refined[1], view.texture_noise, young=self._young):
                 return refined[0]
         tried = self._shifts[self._next : self._next + SCORED_POSES]
         self._next = self._next + SCORED_POSES if self._next + SCORED_POSES < len(self._shifts) else 0
@@ -92,7 +94,7 @@ class Search:
             return None
         # What levels the best pose levels the next ones too: height and tilt change slowly.
         self._levelling = self._levelling @ rigid.inverse(best) @ refined[0]
-        return refined[0] if convincing(refined[1], view.texture_noise) else None
+        return refined[0] if convincing(refined[1], view.texture_noise, young=self._young) else None
 
     def _refine(
         self, T: Array, view: LiveView, frame: Frame6, linearisation: Linearisation
@@ -113,12 +115,14 @@ class Search:
         return result
 
 
-def convincing(n: NormalEquations, texture_noise: float = np.inf) -> bool:
+def convincing(n: NormalEquations, texture_noise: float = np.inf, *, young: bool = False) -> bool:
     """Enough points agree in place, and in texture, to believe a pose that nothing predicted.
 
-    ``texture_noise`` is the cloud's own: a wrong place differs by the texture itself, however young the map.
+    ``texture_noise`` is the cloud's own: a wrong place differs by the texture itself, even if the map is too ``young``
+    to tell texture from noise.
     """
-    return _agrees(n, CONVINCING_SHARE, CONVINCING_TEXTURE) and n.texture_misfit <= WORST_RESIDUAL * texture_noise
+    worst = texture_noise * (WORST_MISFIT_YOUNG if young else WORST_MISFIT)
+    return _agrees(n, CONVINCING_SHARE, CONVINCING_TEXTURE) and n.texture_misfit <= worst
 
 
 def believable(n: NormalEquations) -> bool:

@@ -122,7 +122,7 @@ class Submaps:
         T_older_camera = search.look(view, starts, equations)
         if T_older_camera is None:
             return None
-        scales = Scales(view.pitch_mm, view.pitch_mm / 4.0, view.texture_noise, view.normal_rad)
+        scales = Scales(view.pitch_mm, view.pitch_mm / 4.0, 0.1, view.normal_rad)
         frame = visible_surface(view.live)
         n = equations.at(T_older_camera, old, search.rows, view.live, view.coefficients, frame, scales)
         if health.solve(n, view.sigma_mm).held.size or not convincing(n, view.texture_noise):
