@@ -22,9 +22,9 @@ def unlink_unused() -> None:
     Only at the end of a process: it gives up its own locks, and zenoh keeps one segment for all its sessions.
     """
     for path, descriptors in _open_segments().items():
-        for descriptor in descriptors[1:]:
-            fcntl.flock(descriptor, fcntl.LOCK_UN)
-        with contextlib.suppress(BlockingIOError, FileNotFoundError):
+        with contextlib.suppress(OSError):  # somebody else's, gone, or zenoh's threads have just closed it
+            for descriptor in descriptors[1:]:
+                fcntl.flock(descriptor, fcntl.LOCK_UN)
             fcntl.flock(descriptors[0], fcntl.LOCK_EX | fcntl.LOCK_NB)
             path.unlink()
 
