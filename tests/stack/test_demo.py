@@ -34,9 +34,9 @@ def endo3d(*arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run([*ENDO3D, *arguments], capture_output=True, text=True, timeout=START_LIMIT_S)
 
 
-def top(rig: str) -> list[dict[str, Any]]:
-    rows: list[dict[str, Any]] = json.loads(endo3d("top", "--once", "--json", "--rig", rig).stdout)
-    return rows
+def top(rig: str) -> dict[str, dict[str, Any]]:
+    """service -> how it does now."""
+    return {row["service"]: row for row in json.loads(endo3d("top", "--once", "--json", "--rig", rig).stdout)}
 
 
 def settings(rig: str, folder: Path) -> list[str]:
@@ -66,9 +66,6 @@ def up(rig: str, folder: Path) -> Iterator[subprocess.Popen[str]]:
         try:
             first = endo3d("tap", "pose", "--rig", rig, "-n", "1", "--timeout", str(START_LIMIT_S / 2))
             assert first.returncode == 0, first.stderr
-            end_s = time.monotonic() + START_LIMIT_S
-            while {row["service"] for row in top(rig)} != SERVICES:  # the viewer yields, also while it starts
-                assert time.monotonic() < end_s, top(rig)
             yield process
         finally:
             process.kill()
@@ -77,10 +74,13 @@ def up(rig: str, folder: Path) -> Iterator[subprocess.Popen[str]]:
 @pytest.mark.usefixtures("up")
 class TestAgainstARunningStack:
     def test_top_shows_every_service(self, rig: str) -> None:
-        rows = {row["service"]: row for row in top(rig)}
-        assert set(rows) == SERVICES
+        end_s = time.monotonic() + START_LIMIT_S
+        rows = top(rig)
+        # The viewer yields, also while it starts; a busy machine may have no cloud in one second.
+        while not (set(rows) == SERVICES and rows["decoder"]["rate_hz"] > 0.0):
+            assert time.monotonic() < end_s, rows
+            rows = top(rig)
         assert all(row["alive"] for row in rows.values())
-        assert rows["decoder"]["rate_hz"] > 0.0
         assert rows["decoder"]["latency_p50_ms"] > 0.0
         assert "decoder" in endo3d("top", "--once", "--rig", rig).stdout
 
