@@ -31,7 +31,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 FASTMATH = {"contract", "reassoc", "arcp", "nsz"}
 """Without ``nnan`` and ``ninf``: invalid pixels are NaN, and tests for them must survive."""
 
-INLINED = {"forceinline": True}
+INLINED: dict[str, Any] = {"forceinline": True}
 """Into kernels that call them. A kernel that stays a call exists twice under one name, in its own object and,
 optimised once more, in its caller's; which of both runs would depend on what is loaded first: the process that
 compiles and those that load from the cache would differ in the last bits."""
