@@ -86,6 +86,7 @@ class Odometry:
         self.submaps.clear()
         self.submap = self._begun = 0
         self._failures = 0
+        self._unseen = False
         self._search: Search | None = None
         self._merged = 0
         self._visible = self.map.touched
@@ -93,13 +94,17 @@ class Odometry:
     def track(self, channels: NDArray[np.float32], sequence: int, stamp_ns: int) -> Estimate:
         """One cloud (height, width, 6) float32: x y z mm, intensity, quality, sigma mm."""
         if self._load(channels) < max(_LEAST_POINTS, _LEAST_SHARE * channels.shape[0] * channels.shape[1] / POOL**2):
+            self._unseen = self._last_ns is not None
             return self._lost()
         if self._last_ns is None:
             estimate = self._begin(stamp_ns)
             self._merge(sequence)
             return estimate
         known = None if self._failures else self._register(self._predict(stamp_ns), stamp_ns)
+        if known is not None and self._unseen:
+            known = replace(known, state=State.RELOCALISED)
         estimate = known or self._recover(stamp_ns)
+        self._unseen = estimate.state is State.LOST
         if estimate.state is not State.LOST and estimate.state is not State.RELOCALISED:
             self._merge(sequence)
             if self._merged % _LOOK_BACK == 0:
