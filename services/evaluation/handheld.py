@@ -123,14 +123,14 @@ def _scan(settings: Settings, seconds: float, kept: Path) -> Result:
 
 
 def _variant(settings: Settings, variant: str, before: int) -> Result:
-    """That part with frames that lack an effect."""
+    """That part with frames that lack an effect; None when nothing of it was tracked."""
     run = _run(variant, SHARE_FRAMES, SHARE_FIRST)
     decoding, hand = Clouds(settings, run, calibrated(head_yaml(HEAD))), Merging(MERGING_UM)
     for done, (frame, truth) in enumerate(settings.shots(run), start=1):
         for cloud, where in decoding.of(frame, truth):
             hand.add(cloud, where)
         settings.progress(before + done)
-    return _outcome(hand)
+    return _outcome(hand) if len(hand.map(AT_LEAST).points) else None
 
 
 def _outcome(merging: Merging) -> dict[str, Any]:
@@ -256,7 +256,7 @@ def _share_table(shares: dict[str, Result]) -> Table:
         for feature, (reference, _, _, unit) in PAPER.items():
             ours = (result or {"features": {}})["features"].get(feature)
             cells.append("not seen" if ours is None else f"{ours['value'] - reference:+.{2 if unit == 'deg' else 1}f}")
-        rows.append((variant, *cells, f"{result['odometry']['ate_um']:.1f}" if result else ""))
+        rows.append((variant, *cells, f"{result['odometry']['ate_um']:.1f}" if result else "lost"))
     columns = ("deviation", *(f"{feature} / {PAPER[feature][3]}" for feature in PAPER), "trajectory / um")
     return Table(f"Shares of the error, {SHARE_FRAMES / RATE_HZ:.0f} s", columns, rows)
 
