@@ -87,10 +87,13 @@ def main() -> int:
         if not faults:
             print(f"no such fault; there are: {', '.join(f.name for f in every_fault(room, cables))}", file=sys.stderr)
             return 2
-        outcomes, log = campaign(room, cables, faults)
-        whole_log = not asked.faults or "corrupted log".startswith(tuple(asked.faults))
-        verdict = damage(log, Path(folder), DAMAGED_LOGS) if whole_log else None
-        room.close()
+        try:
+            outcomes, log = campaign(room, cables, faults)
+            whole_log = not asked.faults or "corrupted log".startswith(tuple(asked.faults))
+            with tempfile.TemporaryDirectory(prefix="endo3d-damaged-") as elsewhere:  # the other one is small
+                verdict = damage(log, Path(elsewhere), DAMAGED_LOGS) if whole_log else None
+        finally:
+            room.close()
     show(outcomes, verdict, room.reason)
     if asked.page:
         about_logs = asdict(verdict) if verdict is not None else None

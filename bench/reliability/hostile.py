@@ -14,6 +14,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
+from typing import TypeVar
 
 import numpy as np
 import zenoh
@@ -25,6 +26,10 @@ from endo3d.schemas.messages import Cloud, Frame, Message, Mode
 from endo3d.schemas.topics import Topic
 from endo3d.services.runtime.session import meeting_ports, open_session
 
+T = TypeVar("T")
+
+VERBS = ("mode", "exposure", "seek", "rate", "nonsense")
+"""Those that change nothing when they are refused."""
 HEADER_BYTES = 600
 """Where a message's fields stand; behind them is the array, in which every byte is valid."""
 NOISE = st.binary(max_size=400)
@@ -67,18 +72,10 @@ class Attacker:
             reader.undeclare()
         sent: Counter[str] = Counter()
         for topic in topics.TOPICS:
-            key = topic.key(self._rig, "stranger")
-
-            @settings(
-                max_examples=count, database=None, deadline=None, derandomize=True, suppress_health_check=[*HealthCheck]
-            )
-            @given(broken(self._genuine.get(topic.name, b"")))
-            def send(payload: bytes, topic: Topic = topic, key: str = key) -> None:
+            for payload in drawn(broken(self._genuine.get(topic.name, b"")), count):
                 if not _is_well_formed(topic, payload):
-                    self._session.put(key, payload)
+                    self._session.put(topic.key(self._rig, "stranger"), payload)
                     sent[topic.name] += 1
-
-            send()
         return sent
 
     def foreign(self) -> int:
@@ -90,20 +87,30 @@ class Attacker:
         return sent
 
     def commands(self, services: Sequence[str], count: int) -> int:
-        """Nonsense to every verb of every service that changes nothing when it is refused; how many were sent."""
+        """Nonsense to every service; how many were sent."""
         sent = 0
         for service in services:
-
-            @settings(max_examples=count, database=None, deadline=None, derandomize=True)
-            @given(st.sampled_from(("mode", "exposure", "seek", "rate", "nonsense")), PARAMETERS)
-            def ask(verb: str, payload: bytes, service: str = service) -> None:
-                nonlocal sent
-                for _ in self._session.get(topics.control_key(self._rig, service, verb), payload=payload, timeout=2.0):
+            for verb, payload in drawn(st.tuples(st.sampled_from(VERBS), PARAMETERS), count):
+                key = topics.control_key(self._rig, service, verb)
+                for _ in self._session.get(key, payload=payload, timeout=2.0):
                     pass
                 sent += 1
-
-            ask()
         return sent
+
+
+def drawn(strategy: st.SearchStrategy[T], count: int) -> list[T]:
+    """``count`` examples, the same ones every time."""
+    examples: list[T] = []
+
+    @settings(
+        max_examples=count, database=None, deadline=None, derandomize=True, suppress_health_check=[*HealthCheck]
+    )
+    @given(strategy)
+    def take(example: T) -> None:
+        examples.append(example)
+
+    take()
+    return examples
 
 
 @st.composite
