@@ -35,6 +35,8 @@ SERVICES = ("sequencer", "grabber", "decoder", "odometry", "recorder", "viewer")
 WORLDLY = ("odometry",)
 """Whose process holds the map: a new one begins a new world."""
 CAMERA, PROJECTOR = "camera", "projector"
+TELLING = ("killed by", "restarted", "refused")
+"""Lines that name what happened."""
 STEADY_LIMIT_S, RECOVERY_LIMIT_S = 120.0, 120.0
 STOPPED_S, STALLED_S, FULL_S = 4.0, 4.0, 6.0
 DISK_MB, SHM_MB, FLOOR_MB = 3000, 1500, 512
@@ -174,7 +176,7 @@ def suffer(scan: Scan, fault: Fault) -> Outcome:
     seen = scan.witness.take()
     outcome.tracking, outcome.wrong_states = dict(seen.tracking), dict(seen.wrong_states)
     outcome.wrong_poses, outcome.worst_um = seen.wrong, 1e3 * seen.worst_mm
-    launcher_said = next((line for line in scan.said if "killed by" in line or "restarted" in line), "")
+    launcher_said = next((line for line in scan.said if any(word in line for word in TELLING)), "")
     note = next((f"{name}: {note}" for name, note in seen.notes.items()), "")
     gone = f"{seen.gone[0]}: gone from the bus" if seen.gone else ""
     outcome.state = launcher_said or note or gone or ("counted" if outcome.lost else "")
@@ -248,8 +250,8 @@ def _foreign(scan: Scan) -> None:
 
 def _commands(scan: Scan) -> None:
     with Attacker(scan.rig) as attacker:
-        sent = attacker.commands(scan.services, COMMANDS)
-    scan.said.append(f"stranger: {sent} commands refused")
+        sent, refused = attacker.commands(scan.services, COMMANDS)
+    scan.said.append(f"{refused} of {sent} commands refused with a reason")
 
 
 def _in_words(outcome: Outcome) -> str:

@@ -86,16 +86,16 @@ class Attacker:
             sent += 1
         return sent
 
-    def commands(self, services: Sequence[str], count: int) -> int:
-        """Nonsense to every service; how many were sent."""
-        sent = 0
+    def commands(self, services: Sequence[str], count: int) -> tuple[int, int]:
+        """Nonsense to every service; how many were sent, and how many refused with a reason."""
+        sent = refused = 0
         for service in services:
             for verb, payload in drawn(st.tuples(st.sampled_from(VERBS), PARAMETERS), count):
                 key = topics.control_key(self._rig, service, verb)
-                for _ in self._session.get(key, payload=payload, timeout=2.0):
-                    pass
+                replies = list(self._session.get(key, payload=payload, timeout=2.0))
                 sent += 1
-        return sent
+                refused += any(reply.err is not None for reply in replies)
+        return sent, refused
 
 
 def drawn(strategy: st.SearchStrategy[T], count: int) -> list[T]:
