@@ -68,7 +68,11 @@ def recover(path: Path, out: Path | None = None) -> Report:
         if out is None and inventory.repairable:
             _append_summary(file.fileno(), inventory)
             return inventory.report(path, len(view) - inventory.end)
-        return _write_anew(view, path, out, inventory)
+        try:
+            return _write_anew(view, path, out, inventory)
+        except OSError:  # a full disk: what was begun is of no use
+            _anew(path, out).unlink(missing_ok=True)
+            raise
 
 
 @dataclass(slots=True)
@@ -176,9 +180,13 @@ def _append_summary(descriptor: int, inventory: _Inventory) -> None:
     os.fsync(descriptor)
 
 
+def _anew(path: Path, out: Path | None) -> Path:
+    return out or path.with_suffix(".recovering")
+
+
 def _write_anew(view: memoryview, path: Path, out: Path | None, inventory: _Inventory) -> Report:
     """Write what is whole into ``out``, or in place of ``path``, which stays as ``.damaged``."""
-    target = out or path.with_suffix(".recovering")
+    target = _anew(path, out)
     writer = Writer(FileSink(target), LIBRARY)
     kinds: dict[int, Kind] = {}
     channels: dict[int, int] = {}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import importlib
 import sys
 from importlib.util import find_spec
@@ -125,6 +126,11 @@ def main() -> None:
     except BrokenPipeError:
         sys.stderr.close()  # the reader of our output is gone: nothing to say, and nobody to say it to
         sys.exit(141)
+    except OSError as error:
+        if error.errno != errno.ENOSPC:
+            raise
+        print(f"endo3d: the disk is full ({error.filename or 'writing'}); make room and try again", file=sys.stderr)
+        sys.exit(2)
 
 
 if __name__ == "__main__":
